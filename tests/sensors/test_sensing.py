@@ -362,6 +362,24 @@ def test_loads_taken_for_readings_are_noticed(rng):
         calibrate_frame(loads, readings, **stated)
 
 
+@pytest.mark.parametrize("wrong", ["columns", "mm"])
+def test_moments_that_fit_no_frame_are_not_blamed_on_too_few_loads(rng, wrong):
+    pulls = np.tile(2.0 * np.eye(3), (2, 1))
+    arms = np.repeat([[0.05, 0.0, 0.0], [0.2, 0.0, 0.0]], 3, axis=0)
+    loads = np.concatenate([pulls, np.cross(arms, pulls)], axis=1)
+    frame = SensorFrame(Rotation.random(random_state=2).as_matrix(), [2e-3, -3e-3, -0.01])
+    noise = np.repeat([3e-3, 8e-5], 3)
+    read = loads @ frame.from_base().T + noise * rng.normal(size=loads.shape)
+    stated = {"force_noise": noise[0], "moment_noise": noise[3]}
+    assert calibrate_frame(read, loads, **stated).misfit < 2.0
+    if wrong == "columns":
+        loads = loads[:, [1, 0, 2, 3, 4, 5]]
+    else:
+        loads[:, 3:] *= 1e3
+    with pytest.raises(ValueError, match="neither a right-handed sensor nor a left-handed"):
+        calibrate_frame(read, loads, **stated)
+
+
 def test_loads_that_leave_the_frame_open_are_refused(rng):
     force = np.outer(rng.uniform(0.1, 1.0, 10), [0.0, 0.0, 1.0])
     loads = np.concatenate([force, np.zeros((10, 3))], axis=1)

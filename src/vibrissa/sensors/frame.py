@@ -128,6 +128,7 @@ def _named_axes(names: Sequence[str]) -> Array:
 
 
 _ADVICE = "apply forces in at least two directions, at two points or more"
+_MISFIT = 5.0  # smallest ratio of the residuals of moments to the noise that it does not explain
 _CLEARLY = 2.0  # smallest ratio of the residuals of the two signs of moments that decides
 # Ratio of the shares of moments along forces below which these are loads, and the others readings.
 _LOADS = 0.1
@@ -204,6 +205,12 @@ def calibrate_frame(
     options = [_placed(read, true, force, hand) for hand in (1, -1)]
     left = [option[1] for option in options]
     if max(left) < _CLEARLY * max(min(left), moment_noise):
+        if min(left) > _MISFIT * moment_noise:
+            raise ValueError(
+                "the moments fit neither a right-handed sensor nor a left-handed one (residuals "
+                f"of {min(left) / moment_noise:.0f} times the noise): check the order of rows and "
+                "columns of loads and readings, and that all moments are in N·m"
+            )
         raise ValueError(
             "the moments fit a right-handed sensor as well as a left-handed one: " + _ADVICE
         )

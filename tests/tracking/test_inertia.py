@@ -11,6 +11,7 @@ from vibrissa.objects import Peg
 from vibrissa.simulation import Dynamics, simulate, whisking
 from vibrissa.simulation.dynamics import resonances
 from vibrissa.tracking import TrackOptions, track
+from vibrissa.tracking.refine.inertia import _Swung, inertia_of
 from vibrissa.tracking.trace.trace import Trace
 
 RATE, FRAMES, DAMPING = 500.0, 90, 0.12
@@ -97,3 +98,30 @@ def test_a_whisker_without_mass_is_not_bent_by_inertia():
     root = found.to_dataset().isel(whisker=0)
     assert "inertia" not in found.attrs.get("remarks", "")
     assert ((root["in_contact"] > 0) == (truth["in_contact"] > 0)).mean() > 0.97
+
+
+def rotating(frames, rate):
+    """Points (frame, node, 3) of a rigid whisker that swings about its base, m."""
+    angle = 0.3 * np.sin(2.0 * np.pi * 10.0 * np.arange(frames) / rate)
+    along = np.linspace(0.0, WHISKER.length, 40)
+    toward = np.stack([np.cos(angle), np.sin(angle), np.zeros(frames)], axis=1)
+    return along[:, None] * toward[:, None]
+
+
+@pytest.mark.parametrize("frames", [12, 20])
+def test_trials_shorter_than_the_time_over_which_motion_is_fitted_have_no_inertia(frames):
+    def rest(*_):
+        raise AssertionError
+
+    assert inertia_of(rotating(frames, 1e4), rest, 1e4, 90e-6, stated=True) is None
+
+
+@pytest.mark.parametrize("lost", [slice(50, 51), slice(50, 57), slice(0, 5), slice(50, 75, 8)])
+def test_lost_frames_do_not_accelerate_a_whisker(lost):
+    rate, seen = 1000.0, np.ones(120, dtype=bool)
+    curves = rotating(120, rate)
+    whole = _Swung.of(curves, seen, WHISKER, rate, 1e-6).by_mass
+    seen[lost] = False
+    curves[lost] = np.nan
+    with_lost = _Swung.of(curves, seen, WHISKER, rate, 1e-6).by_mass
+    assert np.abs(with_lost - whole)[seen].max() < 0.15 * np.abs(whole).max()

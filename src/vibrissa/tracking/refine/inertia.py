@@ -89,7 +89,7 @@ class Inertia:
     def without(self, cameras: Sequence[Camera], traces: TraceSeries, curves: Array) -> TraceSeries:
         """Traces of the whisker as it would be without mass, as uncertain as that is."""
         line, sigma = traces.line.copy(), traces.sigma.copy()
-        # What moves a curve as a whole is no error of its shape.
+        # What moves a curve as a whole is not an error of its shape.
         moving = np.sqrt((self.displacement**2).sum(axis=2).mean(axis=1))
         share = _UNSURE * np.minimum(self.size / np.maximum(moving, _NONE), 1.0)
         for view, camera in enumerate(cameras):
@@ -126,7 +126,7 @@ def inertia_of(
     (time,), m; whether its radius is ``stated``, and so its mass over its stiffness nearly known.
     """
     seen: Mask = np.all(np.isfinite(curves), axis=(1, 2))
-    if seen.sum() < _FEWEST:
+    if seen.sum() < _FEWEST or not _windows(seen, rate).any():
         return None
     before, whisker = rest(curves, 0.0)
     swung = _Swung.of(curves, seen, whisker, rate, _NOISE * pixel)
@@ -171,6 +171,11 @@ class _Swung:
         whole = np.array([np.interp(times, times[seen], one[seen]) for one in flat.T]).T
         whole = whole.reshape(curves.shape)
         acceleration = _derivative(whole, rate, 2)
+        # Lines across lost frames have kinks, which are not accelerations of the whisker.
+        known = times[np.pad(_windows(seen, rate), _side(rate), mode="edge")]
+        flat = acceleration[known].reshape(len(known), -1)
+        acceleration = np.array([np.interp(times, known, one) for one in flat.T]).T
+        acceleration = acceleration.reshape(curves.shape)
         by_mass = _bent(whole, acceleration, whisker)
         spacing = np.linalg.norm(np.diff(whole, axis=1), axis=2).mean(axis=1)
         return cls(whole, seen, whisker, by_mass, spacing, rate, noise)
@@ -255,9 +260,22 @@ class _Swung:
         return Inertia(moved, scale, delay, np.nan_to_num(size))
 
 
+def _side(rate: float) -> int:
+    """Number of frames to each side over which motion is fitted."""
+    return max(1, round(rate * _SPAN))
+
+
+def _windows(seen: Mask, rate: float) -> Mask:
+    """Whether all frames of each window over which motion is fitted are seen."""
+    width = 2 * _side(rate) + 1
+    if len(seen) < width:
+        return np.zeros(0, dtype=bool)
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(seen, width).all(axis=1))
+
+
 def _derivative(values: Array, rate: float, order: int) -> Array:
     """First or second derivatives over time, by parabolas over neighbouring frames."""
-    side = max(1, round(rate * _SPAN))
+    side = _side(rate)
     offsets = np.arange(-side, side + 1)
     fit = np.linalg.pinv(np.vander(offsets, 3, increasing=True))[order] * order
     count = len(values) - 2 * side

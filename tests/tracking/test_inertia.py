@@ -1,5 +1,7 @@
 """Whiskers that their own mass bends, by traces that no film was made for."""
 
+import importlib
+
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
@@ -12,7 +14,10 @@ from vibrissa.simulation import Dynamics, simulate, whisking
 from vibrissa.simulation.dynamics import resonances
 from vibrissa.tracking import TrackOptions, track
 from vibrissa.tracking.refine.inertia import _Swung, inertia_of
+from vibrissa.tracking.refine.peg import UncertainPeg
 from vibrissa.tracking.trace.trace import Trace
+
+tracking = importlib.import_module("vibrissa.tracking.track")
 
 RATE, FRAMES, DAMPING = 500.0, 90, 0.12
 WHISKER = vb.Whisker.parabola(
@@ -24,7 +29,7 @@ NEAR = Peg(np.array([20e-3, 8e-3, 0.0]), np.array([0.0, 0.0, 1.0]), 1e-3)
 OPTIONS = TrackOptions(properties={"base_radius": WHISKER.base_radius})
 
 
-def whisked(peg, dynamics):
+def whisked(peg, dynamics, sample=()):
     """Track the traces of a whisker that whisks near a peg; the recording, and the truth."""
     motion = whisking(
         FRAMES / RATE, RATE, frequency=9.0, amplitude=np.radians(24.0), set_point=np.radians(5.0)
@@ -46,7 +51,7 @@ def whisked(peg, dynamics):
         ]
         for view in views
     ]
-    found = track(views, [[one] for one in traces], RATE, OPTIONS)
+    found = track(views, [[one] for one in traces], RATE, OPTIONS, sample=sample)
     return found, truth.isel(whisker=0)
 
 
@@ -91,6 +96,24 @@ def test_contacts_of_a_whisker_with_mass_are_found():
     both = touched & true
     away = np.linalg.norm(root["contact_point"] - truth["contact_point"], axis=-1)[both]
     assert np.median(away) < 0.2e-3
+
+
+def test_a_peg_that_is_seen_is_where_inertia_has_contacts(monkeypatch):
+    """Without what inertia adds to them, contacts of a whisker that rings are off the peg."""
+    seen = UncertainPeg(NEAR, 1e-2 * np.eye(5))
+    monkeypatch.setattr(tracking, "peg_in_images", lambda *_: seen)
+    blank = [np.zeros((500, 500), dtype=np.uint8)]
+    found, truth = whisked(NEAR, Dynamics(damping_ratio=DAMPING), sample=[blank, blank])
+    root = found.to_dataset().isel(whisker=0)
+    remarks = found.attrs["remarks"]
+    assert "its inertia bends it" in remarks
+    assert "touches a peg that both views show" in remarks
+    both = (root["in_contact"].values > 0) & (truth["in_contact"].values > 0)
+    assert both.sum() > 20
+    points = root["contact_point"].values[both]
+    assert np.median(np.linalg.norm(points - truth["contact_point"].values[both], axis=1)) < 60e-6
+    away = np.abs(NEAR.signed_distance(points))
+    assert np.quantile(away, 0.75) < 0.1e-3
 
 
 def test_a_whisker_without_mass_is_not_bent_by_inertia():

@@ -509,7 +509,7 @@ def track_whisker(
     more = hidden.before(shape.length) * options.scaled
     used_options = replace(options, fur=options.fur + more)
     found = _found(fitter, shape, whisker, used, tips, sparse, used_options, sample)
-    fit = found.fit if inertia is None else found.fit.swung(inertia, found.whisker.length)
+    fit = found.fit
     report(f"contact of {name}", 2, 2)
     return Tracked(
         whisker=found.whisker,
@@ -626,6 +626,9 @@ def _bent(fitter: Fitter, begun: _Begun, options: TrackOptions) -> _Bent:
     if length.seen and not tapers:
         whisker, length = tapered_as_it_bends(fitter, whisker, length, pose)
     fit, peg = fitter.fit(whisker, pose, fitter.curves.shape[1], length)
+    if fitter.inertia is not None:
+        # A peg is where contacts are, not where they would be without mass.
+        fit = fit.swung(fitter.inertia, whisker.length)
     return _Bent(whisker, shape, length, pose, unfiltered, fit, peg)
 
 

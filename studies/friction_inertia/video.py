@@ -20,7 +20,7 @@ from friction_inertia.methods import (
     truth_of,
 )
 from vibrissa.recording import Recording
-from vibrissa.tracking import base_pose, rest_shape
+from vibrissa.tracking import BasePose
 from vibrissa.whisker import Whisker
 
 CUTOFFS = (30.0, 50.0, 85.0, 120.0, 200.0, None)
@@ -79,8 +79,10 @@ def filtered_errors(
 ) -> dict[str, np.ndarray]:
     """Errors of the pose, of the paper's signals, of contacts from the sensor, frame by frame."""
     truth, whisker = truth_of(trial.true), Recording(trial.tracked).whisker()
-    curves = trial.tracked["measured"].to_dataset().isel(whisker=0)["centerline"].values
-    pose = base_pose(curves, rest_shape(curves), whisker).filtered(RATE, cutoff)
+    measured = trial.tracked["measured"].to_dataset().isel(whisker=0)
+    names = ("position", "azimuth", "elevation", "roll")
+    unfiltered = BasePose(*(measured[f"unfiltered_base_{name}"].values for name in names))
+    pose = unfiltered.filtered(RATE, cutoff)
     return pose_errors(trial, truth, whisker, found, (pose.rotation, pose.position))
 
 

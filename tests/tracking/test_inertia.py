@@ -1,6 +1,7 @@
 """Whiskers that their own mass bends, by traces that no film was made for."""
 
 import importlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from vibrissa.evaluation import distances_from_curves, refine_curves
 from vibrissa.objects import Peg
 from vibrissa.simulation import Dynamics, simulate, whisking
 from vibrissa.simulation.dynamics import resonances
-from vibrissa.tracking import TrackOptions, track
+from vibrissa.tracking import TrackOptions, rest_shape, track
 from vibrissa.tracking.refine.inertia import _Swung, inertia_of
 from vibrissa.tracking.refine.peg import UncertainPeg
 from vibrissa.tracking.trace.trace import Trace
@@ -137,6 +138,21 @@ def test_trials_shorter_than_the_time_over_which_motion_is_fitted_have_no_inerti
         raise AssertionError
 
     assert inertia_of(rotating(frames, 1e4), rest, 1e4, 90e-6, stated=True) is None
+
+
+def test_shapes_that_do_not_fit_one_another_without_inertia_keep_it():
+    """The rest shape may not be found where displacements are far too large."""
+    curves, calls = rotating(60, 500.0), []
+
+    def rest(shapes, swings):
+        calls.append(shapes)
+        if len(calls) > 1:
+            raise ValueError("hardly any two frames show the whisker over the same length")
+        shape = rest_shape(shapes)
+        return replace(shape, deviation=np.full(len(shapes), 1e-3)), WHISKER
+
+    assert inertia_of(curves, rest, 500.0, 90e-6, stated=True) is None
+    assert len(calls) == 2
 
 
 @pytest.mark.parametrize("lost", [slice(50, 51), slice(50, 57), slice(0, 5), slice(50, 75, 8)])

@@ -130,11 +130,25 @@ def inertia_of(
         return None
     before, whisker = rest(curves, 0.0)
     swung = _Swung.of(curves, seen, whisker, rate, _NOISE * pixel)
-    displacement, numbers = np.zeros_like(curves), (1.0, _DELAY)
-    found = swung.inertia(numbers, before, displacement)
+    try:
+        return _explaining(swung, before, rest, pixel, _STATED if stated else _SCALES)
+    except ValueError:  # without it shapes have less in common than with it
+        return None
+
+
+def _explaining(
+    swung: _Swung,
+    before: RestShape,
+    rest: Callable[[Array, Array | float], tuple[RestShape, Whisker]],
+    pixel: float,
+    limits: tuple[float, float],
+) -> Inertia | None:
+    """Inertia with a scale within limits, if it explains how shapes deviate from that at rest."""
+    numbers = (1.0, _DELAY)
+    found = swung.inertia(numbers, before, np.zeros_like(swung.curves))
     if np.nanmedian(before.deviation) < _LITTLE * np.median(found.size):
         return None
-    limits = _STATED if stated else _SCALES
+    curves = np.where(swung.seen[:, None, None], swung.curves, np.nan)
     for _ in range(_ROUNDS):
         shape, _ = rest(curves - found.displacement, found.unsure)
         last, numbers = numbers, swung.fitted(shape, found.displacement, numbers, limits)

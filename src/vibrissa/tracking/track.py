@@ -61,13 +61,7 @@ from vibrissa.tracking.refine.problem import FitOptions
 from vibrissa.tracking.refine.rods import TraceSeries, rolled
 from vibrissa.tracking.refine.silhouette import bends_otherwise, explains, on_peg, peg_in_images
 from vibrissa.tracking.refine.taper import some_in_contact, tapered_as_it_bends
-from vibrissa.tracking.refine.tilt import (
-    Plane,
-    known_flat,
-    plane_of,
-    projected,
-    unturned,
-)
+from vibrissa.tracking.refine.tilt import Plane, known_flat, plane_of, projected, unturned
 from vibrissa.tracking.space.curve import (
     HiddenPart,
     all_merged,
@@ -478,17 +472,18 @@ def track_whisker(
     on_head = head.seen_from(points)
     tips: Mask = np.all(series.ends[:, :, 1] > 0.5, axis=1)
     sparse = any(trace.sparse for view in traces for trace in view)
-    pixel, flat = pixel_at(cameras, on_head), len(cameras) == 1
+    pixel, flat, scaled = pixel_at(cameras, on_head), len(cameras) == 1, options.scaled
     astray = Astray((_CROSSED if row and not sparse else _ASTRAY) * pixel, blur * pixel)
     rest = partial(_at_rest, options, name, tips, flat, sparse, astray)
-    inertia = inertia_of(
-        points, lambda c, s: rest(head.seen_from(c), s), rate, pixel, options.scaled
-    )
     light, used, swings = points, series, np.zeros(len(points))
+    shape, whisker = rest(on_head, swings)
+    inertia = inertia_of(
+        points, shape, whisker, lambda c, e: rest(head.seen_from(c), e)[0], rate, pixel, scaled
+    )
     if inertia is not None:
         light, swings = points - inertia.displacement, inertia.unsure
         used, on_head = inertia.without(cameras, series, points), head.seen_from(light)
-    shape, whisker = rest(on_head, swings)
+        shape, whisker = rest(on_head, swings)
     plane = plane_of(on_head, shape, tips) if flat else Plane(None, np.zeros(len(points)))
     if plane.head is not None:
         on_head = unturned(on_head, plane.head)
@@ -502,14 +497,12 @@ def track_whisker(
         shape = replace(shape, free=shape.free & ~rolled_over(on_head, shape, whisker))
     report(f"contact of {name}", 1, 2)
     touching = np.isfinite(points).all(axis=(1, 2)) & ~shape.free
-    fitter = Fitter(cameras, fitted, touching, on_head, rate, options.fit, head, objects)
+    within = plane.head or head
+    fitter = Fitter(cameras, fitted, touching, on_head, rate, options.fit, within, objects)
     fitter = replace(fitter, unsure=plane.unsure, hook=hook, inertia=inertia)
-    if plane.head is not None:
-        fitter = replace(fitter, head=plane.head)
-    more = hidden.before(shape.length) * options.scaled
+    more = hidden.before(shape.length) * scaled
     used_options = replace(options, fur=options.fur + more)
     found = _found(fitter, shape, whisker, used, tips, sparse, used_options, sample)
-    fit = found.fit
     report(f"contact of {name}", 2, 2)
     return Tracked(
         whisker=found.whisker,
@@ -519,11 +512,11 @@ def track_whisker(
         shape=found.shape,
         pose=found.pose,
         unfiltered=found.unfiltered,
-        touching=touching & (fit.force != 0.0).any(axis=1),
-        fit=fit if plane.head is None else projected(fit, plane.head),
+        touching=touching & (found.fit.force != 0.0).any(axis=1),
+        fit=found.fit if plane.head is None else projected(found.fit, plane.head),
         head=head,
         length=found.length,
-        scale=scale_sigma(found.whisker, options.fur, more) if options.scaled else np.nan,
+        scale=scale_sigma(found.whisker, options.fur, more) if scaled else np.nan,
         peg=found.peg,
         unlike=found.unlike,
         hook=hook,
@@ -640,7 +633,7 @@ def _at_rest(
     sparse: bool,
     astray: Astray,
     curves: Array,
-    swings: Array | float,
+    swings: Array,
     hidden: float = 0.0,
 ) -> tuple[RestShape, Whisker]:
     """Rest shape from the frames, without a share at the base, or of the known whisker.

@@ -115,20 +115,22 @@ class Inertia:
 
 def inertia_of(
     curves: Array,
-    rest: Callable[[Array, Array | float], tuple[RestShape, Whisker]],
+    before: RestShape,
+    whisker: Whisker,
+    rest: Callable[[Array, Array], RestShape],
     rate: float,
     pixel: float,
     stated: bool,
 ) -> Inertia | None:
     """Find by how much its inertia bends a whisker; None where it does not explain its shapes.
 
-    ``rest`` gives the shape at rest and the whisker of curves (time, node, 3), with their errors
-    (time,), m; whether its radius is ``stated``, and so its mass over its stiffness nearly known.
+    ``before`` is the shape at rest of the curves (time, node, 3) as they are, and ``rest`` gives
+    that of others with errors (time,), m. If the radius is ``stated``, the mass over the stiffness
+    is nearly known.
     """
     seen: Mask = np.all(np.isfinite(curves), axis=(1, 2))
     if seen.sum() < _FEWEST or not _windows(seen, rate).any():
         return None
-    before, whisker = rest(curves, 0.0)
     swung = _Swung.of(curves, seen, whisker, rate, _NOISE * pixel)
     try:
         return _explaining(swung, before, rest, pixel, _STATED if stated else _SCALES)
@@ -139,7 +141,7 @@ def inertia_of(
 def _explaining(
     swung: _Swung,
     before: RestShape,
-    rest: Callable[[Array, Array | float], tuple[RestShape, Whisker]],
+    rest: Callable[[Array, Array], RestShape],
     pixel: float,
     limits: tuple[float, float],
 ) -> Inertia | None:
@@ -150,14 +152,14 @@ def _explaining(
         return None
     curves = np.where(swung.seen[:, None, None], swung.curves, np.nan)
     for _ in range(_ROUNDS):
-        shape, _ = rest(curves - found.displacement, found.unsure)
+        shape = rest(curves - found.displacement, found.unsure)
         last, numbers = numbers, swung.fitted(shape, found.displacement, numbers, limits)
         if not numbers[0] > limits[0]:
             return None
         found = swung.inertia(numbers, shape, found.displacement)
         if abs(numbers[0] - last[0]) < _SETTLED * last[0]:
             break
-    shape, _ = rest(curves - found.displacement, found.unsure)
+    shape = rest(curves - found.displacement, found.unsure)
     free = shape.free & np.isfinite(before.deviation)
     if not free.any():
         return None

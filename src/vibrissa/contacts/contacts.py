@@ -18,8 +18,9 @@ from vibrissa.status import Status, counted, describe, flag_attributes, names
 
 #: Largest number of candidates for one measurement.
 MOST_CANDIDATES = 8
-#: Posterior probability that three standard deviations of a valid covariance may leave out.
-LEFT = 0.0033
+#: Posterior probability that three standard deviations of a valid covariance may leave out, and
+#: their squared radius.
+LEFT, THREE_SIGMA = 0.0033, 14.156
 _LISTED = 5  # contacts in the table of a display
 _CERTAIN = (Status.UNIQUE, Status.TIP_CONTACT)
 _SPACE = ["x", "y", "z"]
@@ -411,12 +412,14 @@ def contacts_of(
         friction=friction,
     )
     first = (..., 0)
+    valid = found.valid[:, 0] & np.isin(status, _CERTAIN)
+    for row in np.flatnonzero(valid & (found.probability[:, 0] < 1.0 - LEFT)):
+        covariance, points = found.covariances[row, 0], found.values[row, :most, 3:]
+        valid[row] = _complete(covariance, points - points[0], found.probability[row, :most])
     return Contacts(
         point=every.point[..., 0, :],
         covariance=every.covariance[..., 0, :, :],
-        covariance_valid=every.covariance_valid[first]
-        & np.isin(whole(status), _CERTAIN)
-        & ~(every.probability[first] < 1.0 - LEFT),
+        covariance_valid=whole(valid),
         chi_squared=whole(chi_squared),
         probability=every.probability[first],
         status=whole(status),
@@ -587,10 +590,14 @@ def contact_of(
     if covariance is None:
         covariance = found.covariances[0, first] * length**2
     probability = float(found.probability[0, first])
+    complete = not probability < 1.0 - LEFT
+    if not complete:
+        away = (found.values[0, :, 3:] - values[3:]) * length
+        complete = _complete(covariance, away, found.probability[0])
     return Contact(
         values[3:] * length,
         covariance,
-        bool(found.valid[0, first]) and status in _CERTAIN and not probability < 1.0 - LEFT,
+        bool(found.valid[0, first]) and status in _CERTAIN and complete,
         chi_squared,
         probability,
         status,
@@ -599,6 +606,12 @@ def contact_of(
         x[1:],
         *rest,
     )
+
+
+def _complete(covariance: Array, away: Array, probability: Array) -> bool:
+    """Whether candidates at (n, 3) within three standard deviations have nearly all probability."""
+    near = np.einsum("ni,in->n", away, np.linalg.pinv(covariance) @ away.T) <= THREE_SIGMA
+    return bool(probability[near].sum() >= 1.0 - LEFT)
 
 
 def nowhere(status: Status, chi_squared: float, discretization: Discretization) -> Contact:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.contacts.charted_whisker import ChartedWhisker
-from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
+from vibrissa.contacts.contacts import THREE_SIGMA, Candidates, Contacts, contacts_of
 from vibrissa.contacts.engine.prior import Prior, possible_candidates, refuse_tip
 from vibrissa.contacts.engine.readout import Named
 from vibrissa.contacts.engine.search import Search, check_scale, estimate
@@ -37,7 +37,7 @@ from vibrissa.contacts.sensing.channels import (
     friction_angle,
 )
 from vibrissa.contacts.sensing.noise import Noise, SensorNoise, explained, sensor_noise
-from vibrissa.contacts.uncertainty.posterior import THREE_SIGMA, ranked
+from vibrissa.contacts.uncertainty.posterior import ranked
 from vibrissa.contacts.uncertainty.valleys import LIKELY_FRICTION
 from vibrissa.contacts.wrench import PROXIMAL, by_probability, chosen, estimate_components
 from vibrissa.deferred import xr

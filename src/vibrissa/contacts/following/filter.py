@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts.contacts import LEFT, Contact
+from vibrissa.contacts.contacts import LEFT, THREE_SIGMA, Contact
 from vibrissa.contacts.engine.prior import Prior, refuse_tip
 from vibrissa.contacts.engine.readout import Measurement
 from vibrissa.contacts.estimator import Estimator
@@ -43,7 +43,6 @@ from vibrissa.contacts.following.mixture import (
 from vibrissa.contacts.following.onset import Beginning, Gaussians, groups
 from vibrissa.contacts.following.units import Course, question_parameters
 from vibrissa.contacts.sensing.noise import explained
-from vibrissa.contacts.uncertainty.posterior import THREE_SIGMA
 from vibrissa.deferred import special
 from vibrissa.numerics import AnyArray, Array, Vector
 from vibrissa.rod import charted_rod

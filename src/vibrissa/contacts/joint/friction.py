@@ -131,7 +131,9 @@ class _Curves:
         spread = np.linalg.inv(information[there])
         across = moved @ spread @ np.swapaxes(moved, 1, 2)
         away = (values - self.fitting.forward.values(x * [1.0, 0.0, 0.0, 0.0]))[:, 3:6]
-        log = log[there] - 0.5 * np.log((away**2).sum(axis=1) + np.trace(across, 0, 1, 2))
+        size = (away**2).sum(axis=1) + np.trace(across, 0, 1, 2)
+        size = np.where(size > 0.0, size, np.inf)  # negative only if the inverse is rounding error
+        log = log[there] - 0.5 * np.log(size)
         turn = friction_angle_derivatives(x)[:, 1:]
         turned = np.einsum("ni,nij,nj->n", turn, spread[:, :3, :3], turn)
         return _Nodes(curve[there], x, values, log, across, turned, joint.misfit[there])

@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.contacts import LEFT
+from vibrissa.contacts.contacts import LEFT, THREE_SIGMA
 from vibrissa.contacts.sensing.channels import CHANNELS, CIRCULAR, channels_of
-from vibrissa.contacts.uncertainty.posterior import THREE_SIGMA, second_moment, squared_distances
+from vibrissa.contacts.uncertainty.posterior import second_moment, squared_distances
 from vibrissa.numerics import Array, IntArray, cholesky, inlined, mahalanobis, quick_exp, vectorised
 from vibrissa.rod import Charted, Rod, SearchTree, StableSet, charted_rod
 

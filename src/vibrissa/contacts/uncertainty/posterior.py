@@ -31,7 +31,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.contacts import LEFT
+from vibrissa.contacts.contacts import LEFT, THREE_SIGMA
 from vibrissa.contacts.uncertainty.expansion import (
     Expansion,
     all_determined,
@@ -55,8 +55,8 @@ CERTAIN = 0.95
 # more than the fourth number, distant contacts matter, of which the second order shows less.
 _LEAST_HELD, _MOST_HELD, _MOST_WIDENED, _WIDENED = 0.93, 0.975, 2.5, 1.3
 _MISSED, _MISSED_FAR = 0.1, 0.03
-#: Squared radii of regions of three standard deviations and of 95 %.
-THREE_SIGMA, HELD = 14.156, 7.815
+#: Squared radius of regions of 95 %.
+HELD = 7.815
 # Error of the second order above which a candidate is weighed to first order; and the most by which
 # a node's log density may exceed that of the first order.
 _BROKEN, _MOST_GAIN = 0.3, 3.0

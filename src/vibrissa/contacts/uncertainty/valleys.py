@@ -28,10 +28,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.contacts import LEFT
+from vibrissa.contacts.contacts import LEFT, THREE_SIGMA
 from vibrissa.contacts.fitting.least_squares import channel_equations, lane_contact, whiten
 from vibrissa.contacts.sensing.channels import FITTED
-from vibrissa.contacts.uncertainty.posterior import HELD, THREE_SIGMA
+from vibrissa.contacts.uncertainty.posterior import HELD
 from vibrissa.numerics import (
     AnyArray,
     Array,

@@ -26,6 +26,7 @@ from vibrissa.contacts.engine.readout import Named
 from vibrissa.contacts.engine.search import Search, check_scale, estimate
 from vibrissa.contacts.fitting.least_squares import Fits
 from vibrissa.contacts.joint.along_whisker import evenly_weighted, leave_few_paths, sought_along
+from vibrissa.contacts.joint.fold import held_back, is_near_fold
 from vibrissa.contacts.joint.forward import Forward, Gravity, finite
 from vibrissa.contacts.joint.friction import along_curves, check_ratio, or_without
 from vibrissa.contacts.joint.joint_fit import Joint, JointFit, check_compliance
@@ -77,6 +78,7 @@ _NEAR_ARC, _NEAR_FORCE = (0.02, 0.05), (0.1, 0.3)
 _AS_BENT, _LEAST_TURN, _LARGEST_TURN = 0.01, 0.2, 1.0
 _FINEST_TURN = 0.02  # spacing of directions, rad, below which resting shapes are not made anew
 _SHAPES = 8  # number of maps of sagged whiskers that are kept
+_FLAT = 1e-12  # smallest variance, over the largest, of covariances that are joined
 _SAME_SAG = 3e-4  # standard deviation of the tip's sag, over L, that a filter neglects
 
 
@@ -448,6 +450,8 @@ class JointEstimate:
         degrees = fitting.degrees(flat[row], fits.values)
         exact = self.sensor is None and degrees == 0
         limit = _EXACT if exact else explained(degrees)
+        if self.forward.weighted and not fitting.friction:
+            fits = held_back(fitting, flat, targets, row, fits, limit)
         doubt = np.linalg.norm(fits.contacts[:, 1:], axis=1)
         if fitting.friction:
             doubt = fits.misfits + (friction_angle(fits.contacts) / LIKELY_FRICTION) ** 2
@@ -507,7 +511,12 @@ class JointEstimate:
         known = np.isfinite(own).all(axis=(1, 2)) & (away[each, place] < _SAME)
         own = np.where(known[:, None, None], own + self._fit.shared(joint), covariance)
         larger = np.trace(own, axis1=1, axis2=2) > np.trace(covariance, axis1=1, axis2=2)
-        return np.where(larger[:, None, None], own, covariance), valid & known & linear
+        out = np.where(larger[:, None, None], own, covariance)
+        # Their folds differ, and near these the regions, which are thin sheets, do as well.
+        bent = known & np.isfinite(covariance).all(axis=(1, 2))
+        bent &= is_near_fold(self.forward, fits)
+        out[bent] = _at_least(covariance[bent], own[bent])
+        return out, valid & known & linear
 
     def _determined(self, sagged: ChartedWhisker) -> bool:
         """Whether the signals determine contacts, as they do on the sagged weightless whisker.
@@ -535,6 +544,16 @@ class JointEstimate:
                     own = Search(sagged, Named(sagged, self.names, self.sensor))
             self._searches = _Searches(self._proposing, exact, own)
         return self._searches
+
+
+def _at_least(a: Array, b: Array) -> Array:
+    """Covariances (n, 3, 3) of which no direction has less variance than in either of two."""
+    variance, axes = np.linalg.eigh(a)
+    root = axes * np.sqrt(np.maximum(variance, _FLAT * variance[:, -1:]))[:, None]
+    back = np.linalg.pinv(root)
+    times, axes = np.linalg.eigh(back @ b @ np.swapaxes(back, 1, 2))
+    root = root @ axes * np.sqrt(np.maximum(times, 1.0))[:, None]
+    return np.asarray(root @ np.swapaxes(root, 1, 2))
 
 
 @lru_cache(maxsize=_SHAPES)

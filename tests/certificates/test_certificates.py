@@ -142,6 +142,18 @@ def test_a_certificate_of_which_anything_was_changed_is_refused(theorem, tmp_pat
         load_certificate(tmp_path / "changed.nc")
 
 
+def test_a_certificate_that_lacks_something_says_what(theorem, tmp_path):
+    path = tmp_path / "incomplete.nc"
+    whole = theorem[2].to_dataset()
+    for name in ("factors", "fold_domain", "rod_edges", "straight", "room"):
+        data = whole.copy(deep=True)
+        (data.attrs if name in data.attrs else data).__delitem__(name)
+        write_forged(path, data)
+        for read in (check_certificate, load_certificate):
+            with pytest.raises(ValueError, match=rf"not a complete certificate: .*\b{name}\b"):
+                read(path)
+
+
 def test_an_unfinished_certificate_does_not_state_100_percent(theorem):
     certificate = copy.deepcopy(theorem[2])
     interior = certificate.parts["interior"]

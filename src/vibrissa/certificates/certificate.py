@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from vibrissa.certificates.checker import covers, identity
+from vibrissa.certificates.checker import covers, identity, refuse_incomplete
 from vibrissa.certificates.conditions import (
     PLANAR,
     SPATIAL,
@@ -380,6 +380,7 @@ class Certificate:
                 "the certificate has been modified since it was written, or is of another version: "
                 "compute a new one, in another file"
             )
+        refuse_incomplete(data)
         evaluated = np.atleast_1d(data.attrs["evaluated"])
         parts = {
             name: Part(

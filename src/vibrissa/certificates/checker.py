@@ -51,6 +51,12 @@ _ROUNDS, _MOST = 9, 512
 _BATCH = 256
 _STATES = 5
 PARTS = ("interior", "proximal", "distal", "fold")
+# Variables and attributes of every certificate's file, besides those of its parts.
+_VARIABLES = ("rod_edges", "rod_local", "rod_coefficients", "rod_twist", "factors", "stations")
+_STATED = (
+    *("straight", "alpha", "room", "sign", "cone", "whisker", "turns", "refuted", "seconds"),
+    "evaluated",
+)
 
 
 @dataclass(frozen=True)
@@ -189,6 +195,7 @@ def check_certificate(
         raise ValueError(f"{path} is not a certificate")
     if identity(data) != data.attrs.get("identity"):
         raise ValueError(f"{path} has been modified since it was written, or is of another version")
+    refuse_incomplete(data)
     if whisker is not None and not is_certificate_of(data, whisker):
         raise ValueError(f"{path} is a certificate of another whisker")
     straight = bool(data.attrs["straight"])
@@ -219,6 +226,17 @@ def check_certificate(
             bounds = _bounds(rows, domain, data["stations"].values)
             held += int(_confirm(data, part, bounds, conditions_hold).sum())
     return Checked(whole, tried, held)
+
+
+def refuse_incomplete(data: xr.Dataset) -> None:
+    """Raise a ValueError for a certificate that lacks some of what it states."""
+    parts = PARTS if data.attrs.get("straight") else CURVED_PARTS
+    kinds = ("domain", "certified", "undecided")
+    needed = [*_VARIABLES, *(f"{part}_{kind}" for part in parts for kind in kinds)]
+    missing = [name for name in needed if name not in data]
+    missing += [name for name in _STATED if name not in data.attrs]
+    if missing:
+        raise ValueError(f"not a complete certificate: it has no {', '.join(missing)}")
 
 
 def identity(data: xr.Dataset) -> str:

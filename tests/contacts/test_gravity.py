@@ -276,6 +276,20 @@ def test_regions_hold_contacts_that_nearly_slip_off_under_gravity(nitinol):
     assert away.max() < 0.05 * whisker.length
 
 
+@pytest.mark.parametrize("using", ["Fx FT Mx MB", "Fx FD Mx MB"])
+def test_the_twist_of_a_straight_whisker_proposes_no_contacts(nitinol, using):
+    """Contacts were sought with that of the sagged whisker, and a third of them not found."""
+    whisker = nitinol.whisker
+    bent = bent_by_random_forces(whisker, (0.0, 0.0, -G), 60)
+    signals = vb.base_signals(bent.force, bent.moment)
+    found = nitinol.estimate(signals, using, gravity=(0.0, 0.0, -G))
+    away = np.linalg.norm(found.candidates.point - bent.contact_point[:, None], axis=-1)
+    assert (np.nanmin(away, axis=1) < 1e-4 * whisker.length).mean() > 0.97
+    unique = found.status == vb.Status.UNIQUE
+    assert (unique.mean() > 0.9) == ("FD" in using)
+    np.testing.assert_array_less(away[unique, 0], 1e-4 * whisker.length)
+
+
 def inside(found, truth):
     """Share of truths in the 95 % regions."""
     away = found.point - truth

@@ -166,6 +166,10 @@ class JointEstimate:
         self.d, whole = self.forward.d, names == WRENCH
         self.channels = Channels(WRENCH, WRENCH) if whole else Channels.of(names)
         self.scale = signal_scales(names, self.d.force, self.d.moment)
+        self._telling = self.channels
+        if not whole and whisker.is_straight and whisker.base_stiffness is None:
+            # A contact does not twist a straight whisker with weight, but that with its shape.
+            self._telling = Channels.of(tuple(name for name in names if name != "Mx"))
         self._least = _least_noise(sensor, names, self.d)
         self._step = self.forward.direction_step(self._least)
         self._shift = _shifts(self.channels.names, self.forward.shift)
@@ -392,15 +396,15 @@ class JointEstimate:
 
     def _farther(self, targets: Array, row: IntArray, x: Array) -> tuple[IntArray, Array]:
         """Proposals x (m, 4) of rows, and others that fits from these do not reach."""
-        along = leave_few_paths(self.channels.signals)
+        along = leave_few_paths(self._telling.signals)
         # With the moment and a direction the force at each arc length is known: there is one path.
-        if not (along and "MB" in self.channels.signals):
+        if not (along and "MB" in self._telling.signals):
             row, x = self._corrected(targets, row, x)
         if not along or not row.size:
             return row, x
-        evenly = evenly_weighted(self.forward, self.channels, self._fit.least)
-        flat = self.signals_of(targets) / self.scale
-        rows, sought = sought_along(evenly, flat, targets, row, x)
+        evenly = evenly_weighted(self.forward, self._telling, self._fit.least)
+        told = self._told(self.signals_of(targets) / self.scale)
+        rows, sought = sought_along(evenly, *told, row, x)
         return np.append(row, rows), np.concatenate([x, sought])
 
     def _corrected(self, targets: Array, row: IntArray, x: Array) -> tuple[IntArray, Array]:
@@ -436,7 +440,7 @@ class JointEstimate:
         status = np.where(known, int(Status.DEGENERATE), int(Status.MISSING))
         x = [np.full((len(flat), 1, 4), np.nan)]
         for search in self._sagged_searches().exact:
-            found, reason, _ = search.batch(flat, self.channels.targets(flat))
+            found, reason, _ = search.batch(*self._told(flat))
             status = reason if len(x) == 1 else status
             x.append(found.x)
         return np.concatenate(x, axis=1), status
@@ -503,7 +507,7 @@ class JointEstimate:
         rod = search.contact_map.chart.discretization
         signals = channels_of(solve_forces(rod, fits.contacts)[0])
         flat = signals[:, [SIGNALS.index(name) for name in self.names]]
-        found, _, _ = search.batch(flat, self.channels.targets(flat))
+        found, _, _ = search.batch(*self._told(flat))
         away = np.abs(found.x[..., 0] - fits.contacts[:, :1])
         away[np.arange(away.shape[1]) >= found.number[:, None]] = np.inf
         each, place = np.arange(len(away)), np.where(np.isfinite(away), away, np.inf).argmin(axis=1)
@@ -518,15 +522,10 @@ class JointEstimate:
         out[bent] = _at_least(covariance[bent], own[bent])
         return out, valid & known & linear
 
-    def _determined(self, sagged: ChartedWhisker) -> bool:
-        """Whether the signals determine contacts, as they do on the sagged weightless whisker.
-
-        Weight does not twist a straight whisker, but that one twists.
-        """
-        names = self.names
-        if "Mx" in names and self.whisker.is_straight and self.whisker.base_stiffness is None:
-            names = tuple(name for name in names if name != "Mx")
-        return len(names) >= 3 and sagged.determines(names)
+    def _told(self, flat: Array) -> tuple[Array, Array]:
+        """Those of the signals (n, k) by which contacts are sought, and their channels."""
+        flat = flat[:, [self.names.index(name) for name in self._telling.signals]]
+        return flat, self._telling.targets(flat)
 
     def _sagged_searches(self) -> _Searches:
         """Searches on the sagged whisker, kept as long as its shape proposes contacts."""
@@ -534,14 +533,16 @@ class JointEstimate:
             assert self.contact_map is not None
             assert self._proposing is not None
             sagged, own, exact = _sagged(self.contact_map, self._proposing), None, []
-            if self._determined(sagged):
+            names = self._telling.signals
+            if len(names) >= 3 and sagged.determines(names):
                 near = dict(zip(self.names, (_NEAR * self.scale).tolist(), strict=True))
+                near = {name: near[name] for name in names}
                 exact = [
-                    Search(sagged, Named(sagged, self.names, sensor))
-                    for sensor in (SensorNoise.of(near, self.names), None)
+                    Search(sagged, Named(sagged, names, sensor))
+                    for sensor in (SensorNoise.of(near, names), None)
                 ]
                 if self.sensor is not None:
-                    own = Search(sagged, Named(sagged, self.names, self.sensor))
+                    own = Search(sagged, Named(sagged, names, self.sensor))
             self._searches = _Searches(self._proposing, exact, own)
         return self._searches
 

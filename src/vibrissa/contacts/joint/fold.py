@@ -138,7 +138,7 @@ def _along_fold(fitting: JointFit, flat: Array, targets: Array, x: Array) -> Fit
 def _fits(fitting: JointFit, flat: Array, targets: Array, x: Array) -> Fits:
     """Contacts x (n, 4) as fits of measurements."""
     there = fitting.forward.solved(x)
-    known = np.isfinite(there.values).all(axis=1)
+    known: Mask = np.asarray(np.isfinite(there.values).all(axis=1))
     fits = Fits(x, there.values, there.tangents, np.zeros(len(x)), known)
     misfits = fitting.joint(flat, targets, fits).misfit
     return fits._replace(misfits=np.where(known & np.isfinite(misfits), misfits, np.inf))

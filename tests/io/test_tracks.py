@@ -91,11 +91,11 @@ def test_missing_is_nan_and_never_zero():
 
 
 def test_what_the_file_does_not_say_is_needed_and_what_it_says_stands():
-    with pytest.raises(ValueError, match=r"a.csv: the unit .* one of m, cm, mm.*does not say"):
+    with pytest.raises(ValueError, match=r"a.csv: the unit .* one of m, cm, mm.*does not state"):
         labelled(deep(), "a.csv")
     with pytest.raises(ValueError, match="'inch' is not known"):
         labelled(deep(), "a.csv", unit="inch")
-    with pytest.raises(ValueError, match=r"in m its whiskers reach across [23]\d.*millimetres"):
+    with pytest.raises(ValueError, match=r"in m its whiskers reach across [23]\d.*unit= in"):
         labelled(deep(), "a.csv", unit="m")
     with pytest.raises(ValueError, match="the unit 'mm', but 'm' is given"):
         labelled(deep(unit="mm"), "a.csv", unit="m")
@@ -209,8 +209,13 @@ def test_units_of_time_and_points_in_the_header(tmp_path):
     np.testing.assert_allclose(tracks["time"], [0.0, 2e-3])
     np.testing.assert_allclose(tracks["centerline"][1, 0, 1], [9e-3, 1e-3, 0.0])
     path.write_text(path.read_text().replace("(mm)", "(um)").replace("[mm]", "[um]"))
-    with pytest.raises(ValueError, match="least that is possible"):
+    with pytest.raises(ValueError, match=r"0\.0005 to 1 m are possible.*correct the header"):
         load_tracks(path)
+    # Without a unit in the header the unit may be stated.
+    path.write_text("frame,x,y,z\n0,0,0,0\n0,9,0,0\n")
+    with pytest.raises(ValueError, match=r"--unit of import"):
+        load_tracks(path)
+    np.testing.assert_allclose(load_tracks(path, unit="mm")["centerline"].values.max(), 9e-3)
     path.write_text("frame,x_mm,y_mm,z_mm\n0,0,0,0\n,9,0,0\n")
     with pytest.raises(ValueError, match="line 3"):
         load_tracks(path)

@@ -389,6 +389,9 @@ def test_loads_that_leave_the_frame_open_are_refused(rng):
     loads = np.concatenate([force, np.cross([0.0, 0.0, 0.01], force)], axis=1)
     with pytest.raises(ValueError, match="one plane"):
         calibrate_frame(loads, loads, force_noise=1e-3, moment_noise=1e-5)
+    for noise in ([1e-3] * 3, np.inf, None):
+        with pytest.raises(ValueError, match="force_noise must be one finite number"):
+            calibrate_frame(loads, loads, force_noise=noise, moment_noise=1e-5)
 
 
 def test_offset_and_weight_are_found_from_free_poses(rng):

@@ -116,7 +116,7 @@ def test_a_contact_that_grows_within_a_second_is_no_drift():
     sensor = Sensor(NAMES, noise=NOISE, drift=DRIFT)
     offset, rng = Offset(sensor, 50), np.random.default_rng(6)
     for i in range(50):
-        assert offset.wanted
+        assert offset.missing
         offset.tare(0.01 * i, NOISE * rng.normal(size=3))
     before = offset.value
     onset, detected = 2.0, 2.8

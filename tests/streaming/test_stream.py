@@ -594,6 +594,20 @@ def test_the_offset_is_found_anew_from_the_first_samples(gamma_map, bent, wrench
         ContactStream(estimator(gamma_map), tare=3)
 
 
+@pytest.mark.parametrize(
+    ("tare", "missing", "touched"), [(10, 0, False), (18, 0, True), (30, 10, False)]
+)
+def test_an_offset_of_too_few_samples_or_of_a_touched_whisker_is_questioned(
+    gamma_map, wrench, tare, missing, touched
+):
+    sensor = Sensor(noise=NOISE)
+    loads = np.concatenate([np.zeros((12, 6)), np.tile(wrench[8], (8, 1))])
+    running = ContactStream(Estimator.of_sensor(gamma_map, sensor), COMPONENTS, tare=tare)
+    list(running.records(csv_lines(sensor.read(np.arange(20.0), loads, 1))))
+    assert running.tare_missing == missing
+    assert ("scatter" in " ".join(advice(running))) == touched
+
+
 def test_a_general_error_is_suspected_where_many_samples_have_no_contact(gamma_map, wrench):
     """As with forces in gf, or rotations inverted: some contacts are found, and are wrong too."""
     wrong = wrench[:8] * np.repeat([0.1, 1.0], 3)

@@ -250,12 +250,11 @@ def _sensor(path: Path) -> Iterator[tuple[str, str]]:
     """Describe a sensor, one line per channel."""
     sensor = vb.sensors.load_sensor(path)
     yield "kind", "sensor; channels, in their own units, of components in N and N·m"
-    numbers = zip(
-        sensor.channels, sensor.mixing, sensor.noise, sensor.bias, sensor.largest, strict=True
-    )
-    for name, mixing, noise, bias, largest in numbers:
+    each = (sensor.mixing, sensor.noise, sensor.bias, sensor.drift, sensor.largest)
+    for name, mixing, noise, bias, drift, largest in zip(sensor.channels, *each, strict=True):
         parts = [f"{a:g} {c}" for a, c in zip(mixing, vb.sensors.COMPONENTS, strict=True) if a]
-        ends = f", saturates at ±{largest:g}" if np.isfinite(largest) else ""
+        ends = f", drift {drift:.3g} in a second" if drift else ""
+        ends += f", saturates at ±{largest:g}" if np.isfinite(largest) else ""
         formula = " + ".join([*parts, f"{bias:.4g}"]).replace("+ -", "- ")
         yield name, f"{formula}, noise {noise:.3g}{ends}"
     x, y, z = 1e3 * sensor.frame.position
@@ -364,6 +363,9 @@ def _without_unit(raw: vb.io.RawTracks, path: Path) -> tuple[xr.Dataset, str]:
     """Label tracks; if the unit of their points is not stated, with the first plausible unit."""
     if raw.space is None or raw.unit:
         return vb.io.labelled(raw, path), ""
+    if raw.usual_unit:
+        with suppress(ValueError):
+            return vb.io.labelled(raw, path), ""
     for unit in ("mm", "m"):
         with suppress(ValueError):
             return vb.io.labelled(raw, path, unit=unit), unit

@@ -308,6 +308,8 @@ def _report(running: vb.streaming.ContactStream, lost: str, follow: bool) -> Non
         remark(whose + ", ".join(f"{name}: {n}" for name, n in running.statuses.most_common()))
     if running.events:
         remark(whose + ", ".join(f"{name}: {n}" for name, n in running.events.items()))
+    if running.tare_missing:
+        remark(f"{whose}--tare: {running.tare_missing} more complete samples are needed")
     _advise(running)
 
 

@@ -95,6 +95,7 @@ class RawTracks:
     # Unit and frame of points in space; empty if the file does not state them.
     unit: str = ""
     reference_frame: str = ""
+    usual_unit: str = ""  # unit that files of this format have unless another one is stated
     # Further variables of the format.
     extra: Mapping[str, xr.Variable] = field(default_factory=dict)
     about: Mapping[str, Any] = field(default_factory=dict)  # further attributes of the format
@@ -128,12 +129,12 @@ def labelled(raw: RawTracks, path: str | PathLike[str], **labels: Unpack[Labels]
         data[name] = xr.Variable(IMAGE[:-1], sure, attributes("confidence"))
         coordinates |= {"view": _views(raw, path, labels), "image_axis": ["column", "row"]}
     if raw.space is not None:
-        unit = _stated(path, "unit", raw.unit, labels.get("unit"))
+        unit = _stated(path, "unit", raw.unit, labels.get("unit")) or raw.usual_unit
         points, sure = _without_zeros(raw.space, raw.space_confidence)
         frame = _stated(path, "reference_frame", raw.reference_frame, labels.get("reference_frame"))
         data["centerline"] = xr.Variable(
             SPACE,
-            points * _factor(path, unit, points),
+            points * _factor(path, unit, points, fixed=bool(raw.unit)),
             {**attributes("centerline"), "reference_frame": frame or "laboratory"},
         )
         data["confidence"] = xr.Variable(SPACE[:-1], sure, attributes("confidence"))
@@ -182,27 +183,25 @@ def _stated(path: Path, name: str, stated: str, given: str | None) -> str:
     return stated or given or ""
 
 
-def _factor(path: Path, unit: str, points: Array) -> float:
-    """Length of the points' unit, m."""
+def _factor(path: Path, unit: str, points: Array, fixed: bool) -> float:
+    """Length of the points' unit, m; the unit is ``fixed`` if the file states it."""
     if unit not in UNITS:
-        got = f"{unit!r} is not known" if unit else "the file does not say it"
+        got = f"{unit!r} is not known" if unit else "the file does not state it"
         raise ValueError(
             f"{path}: the unit of its points in space is needed, one of {', '.join(UNITS)}; {got}"
         )
     known = np.isfinite(points).all(axis=(-2, -1))
-    spans = np.ptp(points[known], axis=-2).max(axis=-1) * UNITS[unit]
+    spans = np.ptp(points[known], axis=-2).max(axis=-1)
     span = float(np.median(spans)) if spans.size else 0.0
-    if span > LONGEST:
-        raise ValueError(
-            f"{path}: in {unit} its whiskers reach across {span:.3g} m, and {LONGEST:g} m is the "
-            "most that is possible; are these millimetres or micrometres?"
-        )
-    if 0.0 < span < SHORTEST:
-        raise ValueError(
-            f"{path}: in {unit} its whiskers reach across {1e3 * span:.3g} mm, and "
-            f"{1e3 * SHORTEST:g} mm is the least that is possible; are these metres or millimetres?"
-        )
-    return UNITS[unit]
+    if span == 0.0 or SHORTEST <= span * UNITS[unit] <= LONGEST:
+        return UNITS[unit]
+    likely = [name for name in ("mm", "um", "cm", "m") if 2e-3 <= span * UNITS[name] <= 0.5]
+    advice = "correct the header" if fixed else "state it, unit= in Python or --unit of import"
+    raise ValueError(
+        f"{path}: in {unit} its whiskers reach across {span * UNITS[unit]:.3g} m, but "
+        f"{SHORTEST:g} to {LONGEST:g} m are possible"
+        + (f"; if they are in {' or '.join(likely)}, {advice}" if likely else "")
+    )
 
 
 def _views(raw: RawTracks, path: Path, labels: Labels) -> list[str]:
@@ -455,6 +454,7 @@ def read_tracks_table(path: str | PathLike[str]) -> RawTracks:
         frames=moments.astype(np.int64) if frame is not None else None,
         time=None if time is None else time[first],
         unit=unit,
+        usual_unit="m",
     )
 
 
@@ -468,7 +468,7 @@ def _coordinates(path: Path, names: Sequence[str]) -> tuple[list[str], str]:
         if set(found) <= set(names):
             return found, unit
     if {"x", "y", "z"} <= set(names):
-        return list("xyz"), "m"
+        return list("xyz"), ""
     raise ValueError(
         f"{path} has the columns {', '.join(names)}; column, row or x_px, y_px (pixels), or x, y, "
         f"z (m; also x_mm and so on: {', '.join(UNITS)}) are needed"

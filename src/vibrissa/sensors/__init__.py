@@ -17,16 +17,14 @@ from vibrissa.sensors.files import (
     save_sensor,
     save_suspended as save_suspended,
 )
-from vibrissa.sensors.frame import FrameCalibration, SensorFrame, calibrate_frame
-from vibrissa.sensors.regression import ThinPlate as ThinPlate
-from vibrissa.sensors.sensor import (
-    COMPONENTS,
-    FORCE_NOISE,
-    GRAVITY,
-    MOMENT_NOISE,
-    Sensor,
+from vibrissa.sensors.frame import (
+    FrameCalibration,
+    SensorFrame,
+    calibrate_frame,
     component_noise as component_noise,
 )
+from vibrissa.sensors.regression import ThinPlate as ThinPlate
+from vibrissa.sensors.sensor import COMPONENTS, FORCE_NOISE, GRAVITY, MOMENT_NOISE, Sensor
 from vibrissa.sensors.stiffness import StiffnessFit, fit_stiffness
 from vibrissa.sensors.suspended import (
     SuspendedWhisker,

@@ -162,6 +162,15 @@ class FrameCalibration:
     misfit: float
 
 
+def component_noise(force_noise: float, moment_noise: float) -> Array:
+    """Covariance (6, 6) of (F, M) with independent noise of equal size in force and in moment."""
+    for name, value in (("force_noise", force_noise), ("moment_noise", moment_noise)):
+        given = numbers(name, value)
+        if given.ndim or not (np.isfinite(given) and given >= 0.0):
+            raise ValueError(f"{name} must be one finite number, not negative; got {value!r}")
+    return np.diag(np.repeat([force_noise**2, moment_noise**2], 3))
+
+
 def calibrate_frame(
     readings: ArrayLike, wrenches: ArrayLike, *, force_noise: float, moment_noise: float
 ) -> FrameCalibration:
@@ -195,7 +204,8 @@ def calibrate_frame(
     read, true = numbers("readings", readings), numbers("wrenches", wrenches)
     if read.ndim != 2 or read.shape[1:] != (6,) or read.shape != true.shape:
         raise ValueError(f"readings and wrenches (n, 6) are needed; got {read.shape}, {true.shape}")
-    if not (force_noise > 0.0 and moment_noise > 0.0):
+    noise = np.sqrt(np.diag(component_noise(force_noise, moment_noise)))
+    if not noise.all():
         raise ValueError(f"noises are positive; got {force_noise} N and {moment_noise} N·m")
     known = np.isfinite(read).all(axis=1) & np.isfinite(true).all(axis=1)
     read, true = read[known], true[known]
@@ -217,7 +227,6 @@ def calibrate_frame(
     hand = 1 if left[0] < left[1] else -1
     position = options[0 if hand == 1 else 1][0]
     sign = hand * round(float(np.linalg.det(force)))
-    noise = np.repeat([force_noise, moment_noise], 3)
 
     def frame(unknowns: Array) -> SensorFrame:
         turn = transform.Rotation.from_rotvec(unknowns[:3]).as_matrix()

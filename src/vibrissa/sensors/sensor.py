@@ -401,11 +401,6 @@ class Sensor:
         return np.asarray(np.clip(reading, -self.largest, self.largest))
 
 
-def component_noise(force_noise: float, moment_noise: float) -> Array:
-    """Covariance (6, 6) of (F, M) with independent noise of equal size in force and in moment."""
-    return np.diag(np.repeat([force_noise**2, moment_noise**2], 3))
-
-
 def _checked_mixing(names: tuple[str, ...], mixing: Any, faults: list[str]) -> Array:
     """Mixing (k, 6) of channels; errors are appended to ``faults``."""
     array = numbers("mixing", 1.0 if mixing is None else mixing, COMPONENTS).copy()

@@ -32,7 +32,7 @@ from vibrissa.numerics import Array
 from vibrissa.objects import Surface, listed_objects
 from vibrissa.recording import Recording, coordinates, recorded, recording_tree
 from vibrissa.rod import SurfaceDeflection, around, check_objects, follow_surfaces
-from vibrissa.sensors import COMPONENTS, FORCE_NOISE, MOMENT_NOISE, Sensor
+from vibrissa.sensors import COMPONENTS, FORCE_NOISE, MOMENT_NOISE, Sensor, component_noise
 from vibrissa.simulation.dynamics import Dynamics, Moment, move_dynamically
 from vibrissa.simulation.motion import Motion
 from vibrissa.status import Status
@@ -300,15 +300,12 @@ def measure(
         their noise in the attribute ``noise``. Missing frames stay missing. For a sensor with other
         channels, ``reading`` and ``mixing`` replace them.
     """
-    for name, value in (("force_noise", force_noise), ("moment_noise", moment_noise)):
-        if not (np.isfinite(value) and value >= 0.0):
-            raise ValueError(f"{name} is {value!r}; it must not be negative")
     names = ("force", "moment")
     truth = Recording(recording).find("truth")
     if truth is None or not all(name in truth for name in names):
         raise ValueError("the recording has no true force and moment, which a sensor would measure")
     if sensor is None:
-        sensor = Sensor(noise=np.repeat([force_noise, moment_noise], 3))
+        sensor = Sensor(noise=np.sqrt(np.diag(component_noise(force_noise, moment_noise))))
     wrench = np.concatenate([truth[name] for name in names], axis=-1)
     time = np.asarray(recording.to_dataset()["time"].values, dtype=np.float64)
     # One sensor per whisker, with independent noise.

@@ -221,7 +221,7 @@ class ContactStream:
         known = {"time": time, **sample.passed}
         if self.whisker:
             known["whisker"] = self.whisker
-        if self._offset.wanted:
+        if self._offset.missing:
             reading = self._compensated(sample.values, rotation, gravity)
             if not np.isfinite(reading).all():
                 return known | {"status": "missing"}
@@ -292,6 +292,16 @@ class ContactStream:
         assert sensor is not None
         left = sensor.compensated(values, rotation, GRAVITY if gravity is None else gravity)
         return left - self._estimator.reading_at_rest(rotation, gravity)
+
+    @property
+    def tare_missing(self) -> int:
+        """Number of complete samples that are still needed to determine the offset."""
+        return self._offset.missing
+
+    @property
+    def tare_scatter(self) -> float:
+        """Largest standard deviation of a channel in the samples to tare with, over its noise."""
+        return self._offset.scatter
 
     @property
     def off_zero(self) -> bool:
@@ -437,6 +447,7 @@ _NEARLY_ALL = 0.9  # share of samples above which a wrong unit of time is suspec
 # error is suspected: noise alone leaves one in a thousand unexplained.
 _MANY, _SEVERAL = 0.2, 5
 _REPEATED = 100  # number of repeated readings of a contact, from which they are questioned
+_UNSTEADY = 3.0  # scatter of the samples to tare with, over the noise, from which it is questioned
 _FAST = 0.02  # share of poses at an implausible speed above which their unit is questioned
 
 
@@ -463,6 +474,12 @@ def advice(stream: ContactStream) -> list[str]:
             "in the units of the sensor's mixing), is the offset removed, and are the sensor's "
             "axes, sign and weight, the base's rotation and the whisker's stiffness right? The "
             "other contacts may be wrong as well."
+        )
+    if stream.tare_scatter > _UNSTEADY:
+        out.append(
+            f"The samples to tare with scatter by {stream.tare_scatter:.0f} times the noise: was "
+            "the whisker touched or moved meanwhile? Then the offset and all contacts are wrong. "
+            "Otherwise the stated noise is too small."
         )
     if measured > 0 and not touching:
         out.append(

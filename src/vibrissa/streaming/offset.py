@@ -51,12 +51,15 @@ class Offset:
         Whether the offset drifts.
     unsteadiness : float
         Standard deviation of readings without contact, in units of the noise.
+    scatter : float
+        Largest standard deviation of a channel in the initial readings, in units of the noise.
     """
 
     def __init__(self, sensor: Sensor | None, tare: int) -> None:
         if tare and sensor is None:
             raise ValueError("tare needs a sensor, to whose channels the offset belongs")
         self.value: Array | float = 0.0
+        self.scatter = 0.0
         self._needed, self._tared = tare, list[Array]()
         self._time, self._touched = math.nan, -math.inf
         self._waiting: deque[tuple[float, Array]] = deque()
@@ -69,15 +72,18 @@ class Offset:
             self._lag = min(_LAG, float((self._noise / np.maximum(self._walk, 1e-300)).min()))
 
     @property
-    def wanted(self) -> bool:
-        """Whether samples without contact are still needed."""
-        return len(self._tared) < self._needed
+    def missing(self) -> int:
+        """Number of samples without contact that are still needed."""
+        return self._needed - len(self._tared)
 
     def tare(self, time: float, reading: Array) -> None:
         """Use one of the initial readings without contact."""
         self._tared.append(reading)
-        if not self.wanted:
+        if not self.missing:
             self.value, self._time = np.mean(self._tared, axis=0), time
+            if self._needed > 1 and self._noise.all():
+                variance = np.var(self._tared, axis=0, ddof=1)
+                self.scatter = float(np.sqrt((variance / self._noise).max()))
 
     def forget(self) -> None:
         """Forget readings and their times, as of a sender that starts again."""

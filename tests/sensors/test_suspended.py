@@ -15,6 +15,7 @@ from vibrissa.sensors import (
     ThinPlate,
     calibrate_suspension,
     follow_sweep,
+    load_sensor,
     load_suspended,
 )
 from vibrissa.whisker import Pose
@@ -453,6 +454,32 @@ def test_the_command_line_goes_from_tables_to_contacts(tmp_path):
     point = recording["estimates"]["contact_point"].values[:, 0]
     np.testing.assert_allclose(point[:, 0], contacts["x"], atol=1e-9)
     assert run(app, ["info", str(tmp_path / "c.nc")]).exit_code == 0
+    for name, step in (("stage.toml", "calibrate"), ("s.nc", "estimate SWEEP.csv --sensor")):
+        done = run(app, ["info", str(tmp_path / name)])
+        assert f"next: vibrissa {step}" in done.output
+    with pytest.raises(ValueError, match="only for sweeps"):
+        load_sensor(tmp_path / "s.nc")
+    # Positions in other units, missing readings, and readings in other units.
+    wrong = [sweep.copy() for _ in range(3)]
+    wrong[0][:, :3] *= 1e3
+    wrong[1][7, 4] = np.nan
+    wrong[2][:, 3:] /= 1e3
+    said = ["unit of the positions", "missing in 1 samples (from 0: 7)", "units of the calibration"]
+    for table, what in zip(wrong, said, strict=True):
+        np.savetxt(tmp_path / "w.csv", table, delimiter=",", header=header, comments="")
+        done = run(app, [*given, "-o", str(tmp_path / "c.csv"), "--force"])
+        assert what in f"{done.exception} {' '.join(done.output.split())}"
+
+
+def test_a_unit_or_an_origin_that_cannot_be_right_is_named(tmp_path):
+    at = points(30)
+    written(tmp_path, at, TRUE.read(at)[0])
+    for unit in ("m", "um"):
+        with pytest.raises(ValueError, match=f"the unit '{unit}' right"):
+            Stage(f"unit = '{unit}'\n{STAGE}", tmp_path).whisker()
+    text = STAGE.replace("[10, 20, 30]\n", "[0, 0, 0]\nfarthest = 10\n")
+    with pytest.raises(ValueError, match=r"no row is a touch; probes are 3\d.* mm from the base"):
+        Stage(text, tmp_path).touches()
 
 
 def test_the_recording_of_a_sweep_gives_the_object():

@@ -10,7 +10,7 @@ import numpy as np
 import vibrissa as vb
 from vibrissa.cli.inputs import WhiskerOptions
 from vibrissa.cli.options import check_new, refuse, with_options
-from vibrissa.cli.terminal import remark, say
+from vibrissa.cli.terminal import progress_bars, remark, say
 from vibrissa.io import unit_factor
 from vibrissa.numerics import Array, Mask
 
@@ -144,15 +144,19 @@ def _suspended(description: Path, target: Path, force: bool) -> None:
     stage = vb.sensors.Stage.load(vb.io.check_readable(description))
     points, readings, rest, drift = stage.touches()
     _check_saturation(stage.channels, readings)
-    found = vb.sensors.calibrate_suspension(
-        stage.whisker(),
-        points,
-        readings,
-        channels=stage.channels,
-        rest=rest,
-        base_sigma=stage.base_sigma,
-        drift=drift,
-    )
+    whisker = stage.whisker()
+    with progress_bars() as tell:
+        tell("calibration", 0, 1)
+        found = vb.sensors.calibrate_suspension(
+            whisker,
+            points,
+            readings,
+            channels=stage.channels,
+            rest=rest,
+            base_sigma=stage.base_sigma,
+            drift=drift,
+        )
+        tell("calibration", 1, 1)
     vb.sensors.save_suspended(target, found, stage)
     far = np.flatnonzero(found.outliers)
     lost = len(points) - int(found.used.sum()) - far.size

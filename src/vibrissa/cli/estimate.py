@@ -304,7 +304,8 @@ def estimate(
     elif sensor is not None:
         if recorded or how.given or weight.gravity is not None:
             raise ValueError(
-                "--sensor of a suspended whisker is for a table; it contains whisker and noise"
+                f"{sensor} is a suspended whisker, with its noise, for tables of its readings: "
+                "omit other options, and recordings"
             )
         _from_sweep(signals, target, sensor)
     elif recorded:
@@ -376,6 +377,8 @@ def _from_lines(
         running = vb.streaming.ContactStream(estimator, names, clock=lambda: float(next(rows)))
         records = list(running.records(vb.io.read_text(signals).splitlines()))
     faults = [f"line {one['line']}: {one['error']}" for one in records if "error" in one]
+    if len(faults) == len(records) > 1:  # the rows follow from the header
+        del faults[1:]
     if faults or not records:
         raise ValueError(f"{signals}: {'; '.join(faults[:_SHOWN]) or 'there are no samples'}")
     columns = {name: [one.get(name, float("nan")) for one in records] for name in _NUMBERS}
@@ -578,6 +581,12 @@ def _from_sweep(table: Path, target: Path, path: Path) -> None:
         f"{found.in_contact.sum()} of {len(found.points)} samples are in contact; m, laboratory "
         "frame"
     )
+    if not found.in_contact.any():
+        change = np.abs(sweep.readings - sweep.readings[0]).max(axis=0) / sensor.uncertainty
+        remark(
+            f"note: readings change by at most {change.max():.2g} times their uncertainty: are "
+            "they in the units of the calibration, and the first sample free of contact?"
+        )
     if target.suffix.lower() in vb.io.NETCDF:
         vb.io.save_recording(target, vb.pipeline.swept_recording(sensor, sweep, found))
         inputs.print_written(target)

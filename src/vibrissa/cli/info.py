@@ -39,10 +39,17 @@ _NEXT = {
     "calibration": "track VIDEO VIDEO --cameras {} -o trial.nc",
     "study": "sweep {} -o study.zarr",
     "settings": "simulate {} -o trial.nc",
+    "stage": "calibrate {} -o sensor.nc",
+    "suspended whisker": "estimate SWEEP.csv --sensor {} -o sweep.nc",
     "the head's pose": "track VIDEO VIDEO --head {} -o trial.nc",
     "contact points": "track VIDEO VIDEO --contact {} -o trial.nc",
     "corrections": "track VIDEO VIDEO --corrections {} -o trial.nc",
     "signals": "estimate {}  # the whisker: --whisker or --map FILE",
+}
+_SETTINGS = {
+    "study": "a study, for vibrissa sweep",
+    "stage": "touches of a suspended whisker by a stage",
+    "settings": "settings, as of vibrissa simulate",
 }
 # What results for other programs are used for.
 _RESULTS = {
@@ -233,10 +240,14 @@ def _summarised(path: Path) -> xr.DataTree:
 def _settings(path: Path) -> Iterator[tuple[str, str]]:
     """Describe other settings, which are checked by the verbs that use them."""
     settings = vb.io.read_toml(path)
-    study = {"whiskers", "tasks"} & set(settings)
-    yield "kind", "a study, for vibrissa sweep" if study else "settings, as of vibrissa simulate"
+    kind = "settings"
+    if {"whiskers", "tasks"} & set(settings):
+        kind = "study"
+    elif "touches" in settings:
+        kind = "stage"
+    yield "kind", _SETTINGS[kind]
     yield "states", ", ".join(settings) or "nothing"
-    yield from _follows("study" if study else "settings", path)
+    yield from _follows(kind, path)
 
 
 def _is_sensor(path: Path) -> bool:
@@ -380,6 +391,14 @@ def _listed(tracks: xr.Dataset, dim: str) -> str:
     return f"{count}: {', '.join(names)}{', …' if count > 8 else ''}"
 
 
+def _suspended(path: Path) -> Iterator[tuple[str, str]]:
+    """Describe a calibrated suspended whisker, one line per channel."""
+    sensor, _ = vb.sensors.load_suspended(path)
+    yield "whisker", repr(sensor.whisker).split(": ", 1)[1]
+    for name, noise, drift in zip(sensor.channels, sensor.noise, sensor.drift, strict=True):
+        yield name, f"noise {noise:.3g}, drift {drift:.3g} from one recording to the next"
+
+
 def _groups(path: Path, whole: bool = False) -> Iterator[tuple[str, str]]:
     """Describe kind, groups and variables of a NetCDF file; of its values only names are read."""
     import h5netcdf
@@ -389,11 +408,13 @@ def _groups(path: Path, whole: bool = False) -> Iterator[tuple[str, str]]:
     if "certificate" in (kind or "") and kind == vb.certificates.KIND:
         yield from _certificate(path, whole)
         return
-    if kind in (MAP, _VERDICTS) and not whole:
+    if kind in (MAP, _VERDICTS, "suspended whisker") and not whole:
         if kind == MAP:
             yield "map", f"{vb.ContactMap.load(path)!r}"[1:-1]
-        else:
+        elif kind == _VERDICTS:
             yield from _verdicts(path)
+        else:
+            yield from _suspended(path)
         yield "also", "groups and variables: --all"
         yield from _follows(kind, path)
         return

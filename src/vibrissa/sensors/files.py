@@ -72,11 +72,19 @@ def load_sensor(path: str | PathLike[str]) -> Sensor:
         Sensor that the file describes.
     """
     path = Path(path)
+    if is_netcdf(path):
+        raise ValueError(f"{path} is NetCDF; a sensor is described in TOML{_only_for_sweeps(path)}")
     table = read_toml(path)
     try:
         return _described(table)
     except ValueError as error:
         raise ValueError(f"{path} describes no sensor: {error}") from error
+
+
+def _only_for_sweeps(path: Path) -> str:
+    """What a calibrated suspended whisker is for; empty for other files."""
+    suspended = read_dataset(path).attrs.get("kind") == KIND
+    return ", and a suspended whisker is only for sweeps (`vibrissa estimate`)" * suspended
 
 
 def _described(table: dict[str, Any]) -> Sensor:
@@ -230,6 +238,7 @@ _TOUCHES = {"file", "origin", "axes", "farthest", "base_sigma", "rest", "drift",
 _SHAPE = {"file", "columns", "leave_out"}
 _WHISKER = {"base_radius", "tip_radius", "youngs_modulus", "noise"}
 _SWEEP = {"origin", "axes", "moves"}
+_WHISKERS = (1e-3, 5.0)  # lengths of whiskers on a stage, m; others are in another unit
 _AT_BASE = 1e-6  # distance from the base up to which a probe is at the base, m
 
 
@@ -325,6 +334,13 @@ class Stage:
                     f"largest is {quoted(own['largest'])}; a number, or one per channel, is needed"
                 )
             touched &= (np.abs(readings) < largest).all(axis=1)
+        if not touched.any():
+            near, far = (end / self._unit for end in (radius.min(), radius.max()))
+            raise ValueError(
+                f"{own['file']}: no row is a touch; probes are {near:.3g} to {far:.3g} "
+                f"{self._table.get('unit', 'mm')} from the base: are origin, columns, unit, "
+                "farthest and largest right?"
+            )
         free = np.median(readings[rest], axis=0) if rest.any() else None
         drift = np.zeros(len(self.channels))
         if "rest" in own:
@@ -353,7 +369,13 @@ class Stage:
         if lacking := [name for name in "xyz" if name not in found]:
             raise ValueError(f"the shape lacks {', '.join(lacking)}: name its columns")
         points = np.stack([found[name] for name in "xyz"], axis=1)
-        apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > _AT_BASE
+        steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        apart = steps > _AT_BASE
+        if not _WHISKERS[0] <= steps.sum() <= _WHISKERS[1]:
+            raise ValueError(
+                f"the points of [[shape]] are {steps.sum():.3g} m from end to end: is the unit "
+                f"{self._table.get('unit', 'mm')!r} right?"
+            )
         own = subtable(self._table, "whisker")
         usual = 1e-4 / self._unit
         noise = self._unit * one_number(own, "noise", 0.0)

@@ -413,6 +413,7 @@ def follow_sweep(
             f"got {y.shape}, {base.shape} and {turn.shape}"
         )
     turn = np.broadcast_to(turn, (len(y), 3, 3))
+    _check_sweep(sensor, y, base)
     change = y - (y[0] if rest is None else numbers("rest", rest, any_unit=True))
     touching = np.any(np.abs(change) > _TOUCHED * sensor.uncertainty, axis=1)
     n = len(y)
@@ -436,6 +437,23 @@ def follow_sweep(
         around = ((0, 0), (first, n - last), (0, 0))
         out = out._replace(shared=np.concatenate([out.shared, np.pad(errors, around)]))
     return out
+
+
+def _check_sweep(sensor: SuspendedWhisker, readings: Array, base: Array) -> None:
+    """Raise ValueError if numbers are missing, or steps are longer than the whisker."""
+    known = np.isfinite(readings).all(axis=1) & np.isfinite(base).all(axis=1)
+    if not known.all():
+        which = ", ".join(str(i) for i in np.flatnonzero(~known)[:5])
+        raise ValueError(
+            f"readings or positions are missing in {(~known).sum()} samples (from 0: {which}): "
+            "leave these samples out"
+        )
+    step = float(np.median(np.linalg.norm(np.diff(base, axis=0), axis=1))) if len(base) > 1 else 0.0
+    if step > sensor.whisker.length:
+        raise ValueError(
+            f"the base moves by {step:.3g} m from one sample to the next, which is more than the "
+            f"whisker's length, {sensor.whisker.length:.3g} m: is the unit of the positions right?"
+        )
 
 
 class _State(NamedTuple):

@@ -222,6 +222,8 @@ def test_files_that_are_no_recordings_are_refused(folder, tmp_path, verb):
         (("signals", "sim.nc", "--source", "rod"), "need wrench_covariance"),
         (("signals", "sim.nc", "--source", "contact-point"), "need contact_point"),
         (("signals", "tracked.nc", "--cutoff", 400), "below half of"),
+        (("signals", "tracked.nc", "--cutoff", 0.06), "longer than the recording"),
+        (("export", "."), "is a folder; the name of a file is needed"),
         (("signals", "sim.nc", "-o", "s.txt"), ".csv is needed"),
         (("estimate", "sim.nc", "--map", "map.nc", "--map", "map.nc"), "2 --map for 1 whiskers"),
         (

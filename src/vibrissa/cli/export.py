@@ -39,6 +39,7 @@ def export(
     if len(recordings) > 1:
         refuse({"--output": target}, "each table is written next to its recording")
         refuse({"--session-start": session_start}, "recordings did not begin at the same time")
+    recordings = [vb.io.check_readable(one) for one in recordings]
     targets = [one.with_suffix(ending) if target is None else target for one in recordings]
     for path in targets:
         check_new(path, (ending,), force)

@@ -14,7 +14,7 @@ from vibrissa.cli.terminal import Tell, remark, say
 from vibrissa.deferred import xr
 
 RECORDING, MAP = "vibrissa recording", "vibrissa contact map"  # kinds of NetCDF files
-_LONGEST = 500.0  # longest whisker, mm
+_SHORTEST, _LONGEST = 0.5, 500.0  # lengths of whiskers, mm
 _LONGEST_FUR = 20.0  # longest part of a whisker that fur hides, mm
 _THICKEST = 10.0  # radius of a whisker above which it may be in micrometres instead of mm, mm
 # Unit of each limit of a region on the command line.
@@ -90,9 +90,10 @@ class TrackedOptions(WhiskerOptions):
         """Stated length of the whisker, m."""
         if length is None:
             return None
-        if not 0.0 < length <= (math.inf if self.any_length else _LONGEST):
+        least, most = (0.0, math.inf) if self.any_length else (_SHORTEST, _LONGEST)
+        if not (length > 0.0 and least <= length <= most):
             raise ValueError(
-                f"--length is {length:g} mm; more than 0 to {_LONGEST:g} mm are allowed, and any "
+                f"--length is {length:g} mm; {_SHORTEST:g} to {_LONGEST:g} mm are allowed, and any "
                 "other with --any-length"
             )
         if self.whisker is not None:
@@ -115,6 +116,11 @@ class TrackedOptions(WhiskerOptions):
             for name, radius in stated.items()
             if radius is not None
         }
+        if base_radius is not None and tip_radius is not None and tip_radius > base_radius:
+            raise ValueError(
+                f"--tip-radius, {tip_radius:g} mm, is larger than --base-radius, {base_radius:g} "
+                "mm: are they exchanged?"
+            )
         if self.whisker is not None:
             return {"whisker": self.read().with_properties(**properties)}
         if self.rat is not None:

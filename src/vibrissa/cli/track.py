@@ -21,7 +21,7 @@ from vibrissa.deferred import xr
 if TYPE_CHECKING:
     _Traces = Sequence[Sequence[Sequence[vb.tracking.Trace]]]
 
-_WIDEST = 1.0  # largest plausible width of a view, m
+_NARROWEST, _WIDEST = 1e-3, 1.0  # plausible widths of a view, m
 _FINEST = 3.0  # width of a whisker's base in the images for which tracing is tuned, pixels
 # Misfit of traces, in standard deviations, above which the rod does not explain them.
 _POOR = 2.0
@@ -96,7 +96,7 @@ class FilmOptions:
             raise ValueError(f"the videos differ in size, {sorted(set(sizes))}: give --cameras")
         pixel_size = vb.cameras.PIXEL_SIZE if self.pixel_size is None else 1e-3 * self.pixel_size
         wide = pixel_size * sizes[0][0]
-        if not 0.0 < wide <= _WIDEST:
+        if not _NARROWEST <= wide <= _WIDEST:
             raise ValueError(
                 f"--pixel-size is {1e3 * pixel_size:g} mm, which makes the views {wide:g} m wide; "
                 "it must be in mm, such as 0.058"

@@ -178,6 +178,7 @@ def test_maps_begin_where_they_are_asked_to(folder, tmp_path):
         (("--region", "left"), "a region is one of all, ELD, CF, CB"),
         (("--region", "x=1:2"), "limits of r (mm), theta and phi (degrees)"),
         (("--region", "r=1"), "limits of r (mm), theta and phi (degrees)"),
+        (("--region", "theta=0:600"), "angles up to 360"),
         (("--region", "r=30:20"), "least value first"),
         (("--least-force", 20, "--greatest-force", 10), "must be below --greatest-force"),
     ],

@@ -220,6 +220,8 @@ def test_a_filter_forgets_a_contact_that_is_lost_and_waits_for_what_is_missing(w
     assert np.linalg.norm(again.point - point) < 0.01
     with pytest.raises(ValueError, match="time is a finite number, s"):
         follow(np.datetime64("2026-01-01T00:00:01"), wrench[3], turn[3], base[3])
+    with pytest.raises(ValueError, match="time is a finite number, s"):
+        follow(wrench[3], time[3], turn[3], base[3])
     with pytest.raises(ValueError, match="times must increase"):
         follow(time[3], wrench[3], turn[3], base[3])
     with pytest.raises(ValueError, match="finite"):

@@ -251,8 +251,9 @@ def test_what_is_no_prior_is_refused(given, message):
 def test_a_region_in_mm_is_refused(gamma_map, bent):
     """No contact is there: all answers would be outside of the prior."""
     signals = vb.base_signals(*bent[:2])
-    with pytest.raises(ValueError, match="no contact of a whisker"):
-        gamma_map.estimate(signals, noise=NOISE, prior=vb.Prior({"r": (5.0, 30.0)}))
+    for limits in ((5.0, 30.0), (5e-6, 3e-5)):  # and mm as metres
+        with pytest.raises(ValueError, match="no contact of a whisker"):
+            gamma_map.estimate(signals, noise=NOISE, prior=vb.Prior({"r": limits}))
 
 
 @pytest.mark.parametrize(

@@ -267,11 +267,14 @@ def _limits(text: str) -> dict[str, tuple[float, float]]:
     for part in text.split(","):
         name, _, values = part.partition("=")
         try:
-            least, greatest = (float(value) * _UNITS[name.strip()] for value in values.split(":"))
+            ends = [float(value) for value in values.split(":")]
+            if name.strip() != "r" and any(360.0 < abs(end) < math.inf for end in ends):
+                raise ValueError
+            least, greatest = (end * _UNITS[name.strip()] for end in ends)
         except (KeyError, ValueError):
             raise ValueError(
                 f"--region is {text!r}; a name, or limits of r (mm), theta and phi (degrees) as "
-                "r=20:35,theta=-30:30 are needed"
+                "r=20:35,theta=-30:30 are needed, angles up to 360"
             ) from None
         limits[name.strip()] = (least, greatest)
     return limits

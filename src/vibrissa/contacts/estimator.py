@@ -206,8 +206,8 @@ class Estimator:
         errors = np.concatenate(shared)
         readout = readout_of(contact_map, h, covariance, errors)
         out._order = None
-        above = felt_above * sensor.unsteadiness
-        out._start(contact_map, readout, len(sensor.channels), above, prior)
+        out._start(contact_map, readout, len(sensor.channels), felt_above, prior)
+        out.felt_above *= sensor.unsteadiness
         out._sensor = sensor
         stated = (stiffness_sigma, felt_above, prior)
         out._again = partial(_on_map, Estimator.of_sensor, sensor, *stated)

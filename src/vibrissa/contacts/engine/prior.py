@@ -28,6 +28,7 @@ from vibrissa.whisker import Whisker
 _REACHED = (0.5, 1.0, 2.0, 3.0)  # standard deviations at which a region is looked for
 _COORDINATES = ("r", "theta", "phi")
 _TURN = 2.0 * np.pi
+_NEAREST = 0.01  # share of the length below which no contacts are searched for
 # Forces in units of EI/L² beyond which a limit leaves out either no contact or all: one at 3 % of
 # the length that bends the whisker by 1 rad has 2,000, one that bends it by 0.003° at the tip 1e-4.
 _FAINTEST, _STRONGEST = 1e-4, 3e3
@@ -138,10 +139,10 @@ class Prior:
                 allowed & in_region(self.region, concave_backward(whisker, points), large)
             )
         nearest, farthest = self.region.get("r", (0.0, np.inf))
-        if nearest > whisker.length:
+        if nearest > whisker.length or farthest < _NEAREST * whisker.length:
             raise ValueError(
                 f"a region has r between {nearest:g} and {farthest:g} m; no contact of a whisker "
-                f"of {whisker.length:g} m is there"
+                f"of {whisker.length:g} m is there: are they in m (on the command line mm)?"
             )
         for name, value in zip(_COORDINATES, spherical(points).T, strict=True):
             if name in self.region:

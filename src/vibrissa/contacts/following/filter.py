@@ -260,7 +260,8 @@ class ContactFilter:
         base = np.asarray(_ORIGIN if position is None else position, dtype=np.float64)
         if turn.shape != (3, 3) or base.shape != (3,):
             raise ValueError(f"a pose is (3, 3) and (3,); got {turn.shape} and {base.shape}")
-        if np.asarray(time).dtype.kind not in "iuf" or not math.isfinite(time):
+        given = np.asarray(time)
+        if given.ndim or given.dtype.kind not in "iuf" or not math.isfinite(time):
             raise ValueError(f"time is a finite number, s; got {time!r}")
         if self._time is not None and not time > self._time:
             raise ValueError(f"times must increase; got {time} s after {self._time} s")

@@ -129,7 +129,7 @@ def test_shapes_missing_samples_and_priors(gamma_map):
     _, _, signals = rubbed(gamma_map, 0.3, count=4)
     columns = {name: signals[name].to_numpy().reshape(2, 2).copy() for name in ("Fx", "MB", "MD")}
     columns["Fx"][1, 1] = np.nan
-    far = vb.Prior({"r": (0.0, 1e-4)})
+    far = vb.Prior({"theta": (3.0, 3.1)})
     found = gamma_map.estimate(columns, noise=NOISE, friction=0.2)
     assert found.point.shape == (2, 2, 3)
     assert found.status[1, 1] == vb.Status.MISSING

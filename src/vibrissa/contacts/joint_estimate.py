@@ -403,8 +403,8 @@ class JointEstimate:
         if not along or not row.size:
             return row, x
         evenly = evenly_weighted(self.forward, self._telling, self._fit.least)
-        told = self._told(self.signals_of(targets) / self.scale)
-        rows, sought = sought_along(evenly, *told, row, x)
+        rest = self._told(self.signals_of(targets) / self.scale)
+        rows, sought = sought_along(evenly, *rest, row, x)
         return np.append(row, rows), np.concatenate([x, sought])
 
     def _corrected(self, targets: Array, row: IntArray, x: Array) -> tuple[IntArray, Array]:

@@ -198,6 +198,10 @@ class JointEstimate:
             degrees = len(self.names) - len(self._rubbing.free) + 1
             far = found.chi_squared[:, 0] > explained(degrees)
             status[some & far] = int(Status.NOT_ONE_CONTACT)
+            lost = np.flatnonzero(~some & (without.number > 0))
+            for ours, theirs in zip(found[1:], without[1:], strict=True):
+                ours[lost, 0] = theirs[lost, 0]
+            found.number[lost] = 1
         return self._possible(found, status)
 
     def following(self, values: Array) -> tuple[Candidates, IntArray]:

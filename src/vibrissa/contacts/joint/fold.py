@@ -1,4 +1,4 @@
-"""Contacts of a rod with weight that nothing can hold, moved back to the fold.
+"""Fitted contacts that nothing can hold, moved back to the fold.
 
 At a fixed arc length and direction of the force across the whisker, the whisker slips off where
 det ∂p/∂(s, f_y, f_z) first falls to zero as the force grows. Equilibria beyond this fold may have
@@ -9,11 +9,13 @@ followed by a return to it along the force.
 
 from __future__ import annotations
 
+from typing import Any, Protocol
+
 import numpy as np
 
 from vibrissa.contacts.fitting.least_squares import Fits
 from vibrissa.contacts.joint.forward import Forward
-from vibrissa.contacts.joint.joint_fit import JointFit
+from vibrissa.contacts.sensing.channels import ratio_of
 from vibrissa.numerics import Array, IntArray, Mask
 
 # Shares of a force at which the determinant is computed: a light one, those below that of the
@@ -29,8 +31,18 @@ _NUDGE = 1e-6
 _SAME, _TRIED = 1e-3, 2
 
 
+class _Fitting(Protocol):
+    """What contacts are fitted with: a `JointFit`, which itself calls `held_back`."""
+
+    forward: Forward
+    least: float
+
+    def joint(self, flat: Array, targets: Array, fits: Fits) -> Any:
+        """Misfits, residuals and their derivatives."""
+
+
 def held_back(
-    fitting: JointFit, flat: Array, targets: Array, row: IntArray, fits: Fits, limit: float
+    fitting: _Fitting, flat: Array, targets: Array, row: IntArray, fits: Fits, limit: float
 ) -> Fits:
     """Fits (m,) of rows; those beyond the fold are moved to it where no other explains the row.
 
@@ -40,7 +52,8 @@ def held_back(
     # Many fits of a row end at the same contact.
     alike = np.column_stack([row, (fits.contacts / _SAME).round()])
     _, one, of = np.unique(alike, axis=0, return_index=True, return_inverse=True)
-    beyond = _is_beyond(forward, fits.contacts[one], fits.tangents[one])[of.reshape(-1)]
+    beyond = slips_before(forward, fits.contacts[one])[of.reshape(-1)]
+    beyond |= volumes(fits.contacts, fits.tangents) <= 0.0
     beyond &= np.isfinite(fits.misfits)
     if not beyond.any():
         return fits
@@ -65,18 +78,26 @@ def held_back(
 def is_near_fold(forward: Forward, fits: Fits) -> Mask:
     """Whether contacts have more than about 0.7 of the force of the fold."""
     light = fits.contacts * [1.0, _LIGHT, _LIGHT, _LIGHT]
-    return np.asarray(_volumes(fits.tangents) < _LITTLE_LEFT * _determinants(forward, light))
+    now = volumes(fits.contacts, fits.tangents)
+    return np.asarray(now < _LITTLE_LEFT * _volumes_at(forward, light))
 
 
-def _volumes(tangents: Array) -> Array:
-    """Det ∂p/∂(s, f_y, f_z) of derivatives (n, 6 or more, 4)."""
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.linalg.det(tangents[:, 3:6, [0, 2, 3]]))
+def volumes(x: Array, tangents: Array) -> Array:
+    """Det ∂p/∂(s, f_y, f_z) (n,), while the ratio of forces along and across is held.
+
+    For contacts x (n, 4) and derivatives (n, 6 or more, 4) with respect to them.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        by_normal = (ratio_of(x) / np.hypot(x[:, 2], x[:, 3]))[:, None] * x[:, 2:]
+        by = tangents[:, 3:6, [0, 2, 3]].copy()
+        by[:, :, 1:] += tangents[:, 3:6, 1:2] * by_normal[:, None, :]
+        return np.asarray(np.linalg.det(by))
 
 
-def _determinants(forward: Forward, x: Array) -> Array:
-    """Det ∂p/∂(s, f_y, f_z) of contacts x (..., 4), NaN where they have no equilibrium."""
-    return _volumes(forward.solved(x.reshape(-1, 4)).tangents).reshape(x.shape[:-1])
+def _volumes_at(forward: Forward, x: Array) -> Array:
+    """The same of contacts x (..., 4), NaN where they have no equilibrium."""
+    flat = x.reshape(-1, 4)
+    return volumes(flat, forward.near(flat)[1]).reshape(x.shape[:-1])
 
 
 def _scaled(x: Array, shares: Array) -> Array:
@@ -86,17 +107,16 @@ def _scaled(x: Array, shares: Array) -> Array:
     return out
 
 
-def _is_beyond(forward: Forward, x: Array, tangents: Array) -> Mask:
-    """Whether the whisker slips off before the force of contacts x (n, 4) is reached."""
+def slips_before(forward: Forward, x: Array) -> Mask:
+    """Whether a whisker slips off well before the force of contacts x (n, 4) is reached."""
     before = np.broadcast_to(_BELOW, (len(x), len(_BELOW)))
-    slips = (_determinants(forward, _scaled(x, before)) <= 0.0).any(axis=1)
-    return np.asarray(slips | (_volumes(tangents) <= 0.0))
+    return np.asarray((_volumes_at(forward, _scaled(x, before)) <= 0.0).any(axis=1))
 
 
 def _on_fold(forward: Forward, x: Array) -> Array:
     """Contacts x (n, 4) with the force at which the whisker slips off, if it does so near it."""
     shares = np.broadcast_to(_SHARES, (len(x), len(_SHARES)))
-    values = _determinants(forward, _scaled(x, shares))
+    values = _volumes_at(forward, _scaled(x, shares))
     first = (values <= 0.0).argmax(axis=1)
     some = np.flatnonzero(first > 0)
     row, first = np.arange(len(some)), first[some]
@@ -106,7 +126,7 @@ def _on_fold(forward: Forward, x: Array) -> Array:
     for _ in range(_BRACKETED):  # regula falsi, with half the value of an end that stays (Illinois)
         with np.errstate(invalid="ignore", divide="ignore"):
             middle = np.clip(low + (high - low) * above / (above - below), low, high)
-        value = _determinants(forward, _scaled(near, middle[:, None]))[:, 0]
+        value = _volumes_at(forward, _scaled(near, middle[:, None]))[:, 0]
         up = value > 0.0
         below, above = np.where(up, 0.5 * below, value), np.where(up, value, 0.5 * above)
         low, high = np.where(up, middle, low), np.where(up, high, middle)
@@ -115,7 +135,7 @@ def _on_fold(forward: Forward, x: Array) -> Array:
     return out
 
 
-def _along_fold(fitting: JointFit, flat: Array, targets: Array, x: Array) -> Fits:
+def _along_fold(fitting: _Fitting, flat: Array, targets: Array, x: Array) -> Fits:
     """Contacts on the fold that fit measurements best, from starts x (n, 4) on it."""
     forward, n = fitting.forward, len(x)
     best, shorten, step = _fits(fitting, flat, targets, x), np.ones(n), np.empty((n, 3))
@@ -135,16 +155,16 @@ def _along_fold(fitting: JointFit, flat: Array, targets: Array, x: Array) -> Fit
     return best
 
 
-def _fits(fitting: JointFit, flat: Array, targets: Array, x: Array) -> Fits:
+def _fits(fitting: _Fitting, flat: Array, targets: Array, x: Array) -> Fits:
     """Contacts x (n, 4) as fits of measurements."""
-    there = fitting.forward.solved(x)
-    known: Mask = np.asarray(np.isfinite(there.values).all(axis=1))
-    fits = Fits(x, there.values, there.tangents, np.zeros(len(x)), known)
+    values, tangents = fitting.forward.near(x)
+    known: Mask = np.asarray(np.isfinite(values).all(axis=1))
+    fits = Fits(x, values, tangents, np.zeros(len(x)), known)
     misfits = fitting.joint(flat, targets, fits).misfit
     return fits._replace(misfits=np.where(known & np.isfinite(misfits), misfits, np.inf))
 
 
-def _step(fitting: JointFit, flat: Array, targets: Array, fits: Fits) -> Array:
+def _step(fitting: _Fitting, flat: Array, targets: Array, fits: Fits) -> Array:
     """Steps (n, 3) of s, f_y and f_z to the least misfit on the plane that touches the fold."""
     joint, x = fitting.joint(flat, targets, fits), fits.contacts
     design, residuals = np.nan_to_num(joint.design), np.nan_to_num(joint.residuals)
@@ -153,7 +173,7 @@ def _step(fitting: JointFit, flat: Array, targets: Array, fits: Fits) -> Array:
     nudge = np.stack([np.full(len(x), -_NUDGE), force * _NUDGE, force * _NUDGE], axis=1)
     ahead = np.repeat(x[:, None], 4, axis=1)
     ahead[:, [1, 2, 3], [0, 2, 3]] += nudge
-    values = _determinants(fitting.forward, ahead)
+    values = _volumes_at(fitting.forward, ahead)
     normal[:, 0, :3] = np.nan_to_num((values[:, 1:] - values[:, :1]) / nudge)
     held[..., 0] = 1.0
     step = _within(design, residuals, normal)

@@ -35,12 +35,12 @@ import numpy as np
 
 from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates
 from vibrissa.contacts.fitting.least_squares import Fits
+from vibrissa.contacts.joint.fold import slips_before, volumes
 from vibrissa.contacts.joint.joint_fit import HELD, Joint, JointFit
 from vibrissa.contacts.sensing.channels import (
     friction_angle,
     friction_angle_derivatives,
     ratio_derivatives,
-    ratio_of,
 )
 from vibrissa.contacts.sensing.noise import SensorNoise
 from vibrissa.contacts.uncertainty.posterior import ranked
@@ -126,7 +126,7 @@ class _Curves:
             log = log - 0.5 * np.linalg.slogdet(information)[1] - 0.5 * fits.misfits
         there = np.isfinite(log) & (np.abs(fits.contacts[:, 0] - x[:, 0]) < 10.0 * HELD)
         there &= np.isfinite(fits.misfits)
-        log[~_upright(fits)] = -np.inf
+        log[~(volumes(fits.contacts, fits.tangents) > 0.0)] = -np.inf
         x, moved, values = fits.contacts[there], joint.moved[there][..., 1:], joint.values[there]
         spread = np.linalg.inv(information[there])
         across = moved @ spread @ np.swapaxes(moved, 1, 2)
@@ -160,7 +160,8 @@ class _Curves:
     def finer(self, row: IntArray, nodes: _Nodes, starts: _Nodes) -> tuple[_Nodes, IntArray]:
         """Insert contacts about the peaks of the density, and about the start of each curve.
 
-        The stable part of a curve may consist of several pieces: return also the row of each.
+        The stable part of a curve may consist of several pieces, of which some are not connected to
+        rest and left out: return also the row of each.
         """
         peaks = _joined([nodes.rows(_peaks(nodes)), starts])
         curve = peaks.curve
@@ -184,16 +185,11 @@ class _Curves:
         gap = np.cumsum(~stable) + every.curve
         curve, number = every.curve[stable], np.cumsum(np.diff(gap[stable], prepend=-1) > 0) - 1
         first = np.flatnonzero(np.diff(number, prepend=-1))
-        return every.rows(stable)._replace(curve=number), row[curve[first]]
-
-
-def _upright(fits: Fits) -> AnyArray:
-    """Which contacts are stable while the ratio is held."""
-    x, t = fits.contacts, np.nan_to_num(fits.tangents)
-    by_normal = (ratio_of(x) / np.hypot(x[:, 2], x[:, 3]))[:, None] * x[:, 2:]
-    by = t[:, 3:6, [0, 2, 3]].copy()
-    by[:, :, 1:] += t[:, 3:6, 1:2] * by_normal[:, None, :]
-    return np.asarray(np.linalg.det(by) > 0.0)
+        pieces, held = every.rows(stable), np.ones(len(first), np.bool_)
+        if first.size:
+            held = ~slips_before(self.fitting.forward, pieces.x[first])
+        number, kept = (np.cumsum(held) - 1)[number], held[number]
+        return pieces._replace(curve=number).rows(kept), row[curve[first[held]]]
 
 
 def _peaks(nodes: _Nodes) -> IntArray:

@@ -27,6 +27,7 @@ import numpy as np
 
 from vibrissa.contacts.contacts import Candidates
 from vibrissa.contacts.fitting.least_squares import Fits
+from vibrissa.contacts.joint.fold import held_back
 from vibrissa.contacts.joint.forward import Forward
 from vibrissa.contacts.joint.second_order import (
     SINGULAR,
@@ -262,13 +263,17 @@ class JointFit:
         out, degrees = found.allowed_first(there), 0  # a copy
         if row.size:
             fits = self.fit(flat[row], targets[row], out.x[row, place])
+            degrees = self.degrees(flat[row], fits.values)
+            if not self.friction:
+                fits = held_back(self, flat, targets, row, fits, explained(degrees))
+                there[row, place] = np.isfinite(fits.misfits)
             joint = self.joint(flat[row], targets[row], fits)
             out.x[row, place], out.values[row, place] = fits.contacts, joint.values[:, :6]
             out.covariances[row, place] += self.shared(joint)
             if joint.design.shape[1:] == (len(self.names) + len(self.forward.errors),) * 2:
                 out.covariances[row, place] += self._curved(targets[row], fits, joint)
             out.chi_squared[row, place] = joint.misfit
-            degrees = self.degrees(flat[row], fits.values)
+            out = out.allowed_first(there)
         first = out.chi_squared[:, 0]
         better = np.isin(status, _MISFITS) & (found.number > 0) & (first <= explained(degrees))
         sure = (out.probability[:, 0] > CERTAIN) | (found.number == 1)

@@ -145,7 +145,10 @@ def test_a_stream_knows_the_same(folder, tmp_path, bent):
 def test_a_stream_takes_errors_from_the_sensors_file(folder, tmp_path):
     sigma = {}
     for gain in (0.0, 0.05):
-        save_sensor(tmp_path / "sensor.toml", Sensor(noise=NOISE, gain_error=gain, drift=2e-9))
+        save_sensor(
+            tmp_path / "sensor.toml",
+            Sensor(noise=NOISE, gain_error=gain, drift=2e-9, resolution=1e-9),
+        )
         some = lines(folder, tmp_path, "--sensor", tmp_path / "sensor.toml", "--threshold", 0)
         sigma[gain] = some[0]["sigma_x"]
     assert sigma[0.05] > 1.2 * sigma[0.0]
@@ -153,7 +156,7 @@ def test_a_stream_takes_errors_from_the_sensors_file(folder, tmp_path):
     assert "the --sensor's file states gain_error" in fault(*words, "--gain-sigma", 1)
     described = done("info", tmp_path / "sensor.toml")
     assert "gain known to 5 %" in described
-    assert "drift 2e-09 in a second" in described
+    assert "resolution 1e-09, drift 2e-09 in a second" in described
 
 
 def test_maps_begin_where_they_are_asked_to(folder, tmp_path):

@@ -265,6 +265,7 @@ def test_bases_are_stated_by_whisker_or_by_view(capsys, by_whisker):
         (("--base-radius", "0.1", "--tip-radius", "0.2"), "are they exchanged?"),
         (("--rate", "0"), "--rate is 0"),
         (("--rate", "170", "--cutoff", "85"), "below half of 170 frames/s"),
+        (("--cutoff", "0.06"), "longer than the recording"),
         (("--base-radius", "-1"), "--base-radius is -1"),
         (("--rat", "C2", "--base-radius", "0.1"), "--rat determines the radii"),
         (("--rat", "Z9"), "Z9"),

@@ -121,6 +121,16 @@ def test_other_files_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"is a folder of session\.nwb"):
         load_array(zarr)
     (zarr / "session.nwb").unlink()
+    for name in ("C2", "contacts", "touches"):
+        (zarr / f"{name}.csv").write_text("x_mm,y_mm,z_mm\n0,0,0\n10,0,0\n20,1,0\n30,3,0\n")
+    with pytest.raises(ValueError, match=r": contacts\.csv, touches\.csv: .*'touches'") as fault:
+        load_array(zarr)
+    assert str(fault.value).count("row and column") == 1
+    (zarr / "C2.csv").unlink()
+    with pytest.raises(ValueError, match=r"is a folder of contacts\.csv; touches\.csv; one of cen"):
+        load_array(zarr)
+    (zarr / "contacts.csv").unlink()
+    (zarr / "touches.csv").unlink()
     zarr.rmdir()
     with pytest.raises(ValueError, match="is a folder of nothing"):
         load_array(tmp_path)

@@ -453,7 +453,18 @@ def test_the_command_line_goes_from_tables_to_contacts(tmp_path):
     assert recording["contact_shared"].sizes["error"] >= 3
     point = recording["estimates"]["contact_point"].values[:, 0]
     np.testing.assert_allclose(point[:, 0], contacts["x"], atol=1e-9)
-    assert run(app, ["info", str(tmp_path / "c.nc")]).exit_code == 0
+    said = run(app, ["info", str(tmp_path / "c.nc")]).output
+    assert "40 frames, without times" in said
+    assert "estimates (missing: contour)" in said
+    with pytest.warns(UserWarning, match="do not fit the shape"):
+        vb.io.save_recording(tmp_path / "c.nc", vb.pipeline.with_contour(recording, "plane"))
+    assert "next: vibrissa report" in run(app, ["info", str(tmp_path / "c.nc")]).output
+    done = run(app, ["report", str(tmp_path / "c.nc")])
+    assert "vibrissa signals" not in done.output
+    given[1] = str(tmp_path / "touches.csv")
+    done = run(app, [*given, "-o", str(tmp_path / "t.csv")])
+    assert "has the touches of the calibration; a sweep is needed" in str(done.exception)
+    given[1] = str(tmp_path / "w.csv")
     for name, step in (("stage.toml", "calibrate"), ("s.nc", "estimate SWEEP.csv --sensor")):
         done = run(app, ["info", str(tmp_path / name)])
         assert f"next: vibrissa {step}" in done.output

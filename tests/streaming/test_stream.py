@@ -920,6 +920,14 @@ def test_several_whiskers_in_one_stream(gamma_map, bent, wrench, kind):
         ContactStreams(2 * [ContactStream(estimator(gamma_map))])
 
 
+def test_whiskers_of_a_line_without_a_time_are_read_at_one_time(gamma_map, wrench):
+    both = ContactStreams([ContactStream(estimator(gamma_map), whisker=w) for w in ("a", "b")])
+    named = [f"{w}.{n}" for w in "ab" for n in COMPONENTS]
+    lines = [json.dumps(dict(zip(named, [*row, *row], strict=True))) for row in wrench[:2].tolist()]
+    time = [record["time"] for record in both.records(lines)]
+    assert time[0] == time[1] < time[2] == time[3]
+
+
 def test_two_whiskers_from_the_command_line(map_file, bent, wrench, tmp_path):
     pytest.importorskip("rosbags")
     rows = [

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 import vibrissa as vb
-from vibrissa.cli.inputs import TrackedOptions, cameras_from, objects_from
+from vibrissa.cli.inputs import TrackedOptions, cameras_from, filtered_at, objects_from
 from vibrissa.cli.options import check_new, with_options
 from vibrissa.cli.terminal import progress_bars, remark
 from vibrissa.cli.track import print_tracked
@@ -65,7 +65,7 @@ def import_tracks(
     # Twelve digits remove the rounding errors of differences of times.
     per_second = float(f"{1.0 / float(np.median(np.diff(found['time'].values))):.12g}")
     how = vb.tracking.TrackOptions(
-        cutoff=vb.tracking.usual_cutoff(per_second) if cutoff is None else cutoff or None,
+        cutoff=filtered_at(cutoff, per_second, found.sizes["time"] / per_second),
         length=own.tracked_length(length),
         fur=own.hidden(fur),
         **own.tracked(base_radius, tip_radius),

@@ -181,15 +181,20 @@ def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
         f"vibrissa recording, {found.origin}, {_size(path)}; "
         f"{'whisker' if one else f'whiskers {len(found.whiskers)}'}: {names}",
     )
-    rate = f" at {found.frames / found.duration:g} a second" if found.duration else ""
     moves = f"; the base moves within {shown('base_position', found.extent, 3)}"
     moves = moves if np.isfinite(found.extent) else ""
-    yield "duration", f"{found.duration:g} s, {found.frames} frames{rate}{moves}"
+    lasts = f"{found.frames} frame{'s' * (found.frames != 1)}, without times"
+    if found.duration:
+        rate = found.frames / found.duration
+        lasts = f"{found.duration:g} s, {found.frames} frames at {rate:g} a second"
+    yield "duration", f"{lasts}{moves}"
     yield "contacts", _contacts(found)
     if found.events:
         events = ", ".join(f"{name}: {n}" for name, n in found.events.items())
         yield "events", f"{events} (of the estimates)"
-    missing = [stage for stage in vb.pipeline.STAGES if stage not in found.stages]
+    # Of a stage the earlier ones are not needed: a sweep of a suspended whisker has no signals.
+    stages = vb.pipeline.STAGES
+    missing = stages[stages.index(found.stages[-1]) + 1 :] if found.stages else stages
     lacking = ", ".join(missing)
     there = ", ".join(found.stages) or "none"
     yield "stages", f"{there}{f' (missing: {lacking})' if missing else ''}"
@@ -261,10 +266,13 @@ def _sensor(path: Path) -> Iterator[tuple[str, str]]:
     """Describe a sensor, one line per channel."""
     sensor = vb.sensors.load_sensor(path)
     yield "kind", "sensor; channels, in their own units, of components in N and N·m"
-    each = (sensor.mixing, sensor.noise, sensor.bias, sensor.drift, sensor.largest)
-    for name, mixing, noise, bias, drift, largest in zip(sensor.channels, *each, strict=True):
+    each = (sensor.mixing, sensor.noise, sensor.bias, sensor.resolution, sensor.drift)
+    for name, mixing, noise, bias, step, drift, largest in zip(
+        sensor.channels, *each, sensor.largest, strict=True
+    ):
         parts = [f"{a:g} {c}" for a, c in zip(mixing, vb.sensors.COMPONENTS, strict=True) if a]
-        ends = f", drift {drift:.3g} in a second" if drift else ""
+        ends = f", resolution {step:.3g}" if step else ""
+        ends += f", drift {drift:.3g} in a second" if drift else ""
         ends += f", saturates at ±{largest:g}" if np.isfinite(largest) else ""
         formula = " + ".join([*parts, f"{bias:.4g}"]).replace("+ -", "- ")
         yield name, f"{formula}, noise {noise:.3g}{ends}"

@@ -391,6 +391,22 @@ def wrench_from(path: Path) -> xr.Dataset:
     return wrench.isel(whisker=0)
 
 
+def filtered_at(cutoff: float | None, rate: float, duration: float) -> float | None:
+    """Cut-off of the filter of the pose, Hz, by default the usual one; None for no filter."""
+    if cutoff is None:
+        return vb.tracking.usual_cutoff(rate)
+    if not 0.0 <= cutoff < 0.5 * rate:
+        raise ValueError(
+            f"--cutoff is {cutoff:g} Hz; it must be below half of {rate:g} frames/s, or 0 for none"
+        )
+    if 0.0 < cutoff * duration < 1.0:
+        raise ValueError(
+            f"--cutoff is {cutoff:g} Hz, whose period is longer than the recording, "
+            f"{duration:.3g} s; 0 leaves the pose unfiltered"
+        )
+    return cutoff or None
+
+
 def frames_from(table: Path) -> vb.pipeline.Frames:
     """Read force and moment over time from a table of signals."""
     time, force, moment, notes = vb.io.read_signals(table)

@@ -79,15 +79,9 @@ class SourceOptions:
             return {"source": source, "whiskers": whiskers, "dynamics": self.dynamics}
         time = recording.to_dataset()["time"].values
         rate = 1.0 / float(np.median(np.diff(time))) if len(time) > 1 else np.inf
-        usual = vb.tracking.usual_cutoff(rate)
-        if self.cutoff and self.cutoff * np.ptp(time) < 1.0:
-            raise ValueError(
-                f"--cutoff is {self.cutoff:g} Hz, whose period is longer than the recording, "
-                f"{np.ptp(time):.3g} s; 0 leaves the pose unfiltered"
-            )
         return {
             "source": source,
-            "cutoff": usual if self.cutoff is None else self.cutoff or None,
+            "cutoff": inputs.filtered_at(self.cutoff, rate, len(time) / rate),
             "whiskers": own.in_recording(recording),
             "proximal": inputs.smallest_arc(proximal),
             "dynamics": self.dynamics,

@@ -324,12 +324,9 @@ def track(
     if clicks and clicks.pixel_size and filmed.cameras is None and filmed.pixel_size is None:
         views = replace(filmed, pixel_size=1e3 * clicks.pixel_size).seen_by(videos)
     rate = filmed.frames_per_second
-    if cutoff is not None and not 0.0 <= cutoff < 0.5 * rate:
-        raise ValueError(
-            f"--cutoff is {cutoff:g} Hz; it must be below half of {rate:g} frames/s, or 0 for none"
-        )
+    lasts = (vb.io.video_info(videos[0]).frames or math.inf) / rate
     how = vb.tracking.TrackOptions(
-        cutoff=vb.tracking.usual_cutoff(rate) if cutoff is None else cutoff or None,
+        cutoff=inputs.filtered_at(cutoff, rate, lasts),
         offset=None if filmed.offset == "auto" else int(filmed.offset),
         rough=filmed.cameras is None and filmed.distance != math.inf,
         distance=filmed.distance,

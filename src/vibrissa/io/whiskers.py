@@ -396,12 +396,15 @@ def save_array(path: str | PathLike[str], array: WhiskerArray) -> None:
 def _folder(path: Path, base: Any, noise: float | None) -> WhiskerArray:
     """Array from a folder with one digitised centreline per whisker."""
     files = sorted(file for file in path.iterdir() if file.suffix.lower() == ".csv")
-    if not files:
-        raise ValueError(f"{path} {_of_folder(path)}")
-    whiskers, faults = [], []
+    whiskers, faults, unnamed = [], [], []
     for file in files:
         try:
             identity = Identity.of(file.stem)
+        except ValueError as fault:
+            unnamed.append(file.name)
+            advice = str(fault)
+            continue
+        try:
             whisker = load_whisker(file, base=base, noise=noise)
         except ValueError as fault:
             faults.append(f"{file.name}: {fault}")
@@ -409,6 +412,10 @@ def _folder(path: Path, base: Any, noise: float | None) -> WhiskerArray:
         if _table(file).radii is None:
             whisker = whisker.with_properties(rat=identity.name)
         whiskers.append(whisker)
+    if len(unnamed) == len(files):
+        raise ValueError(f"{path} {_of_folder(path)}")
+    if unnamed:
+        faults.insert(0, f"{', '.join(unnamed)}: {advice}")
     if faults:
         raise ValueError(f"{path}: {few_faults(faults)}")
     with in_file(path):

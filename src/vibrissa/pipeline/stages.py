@@ -191,9 +191,9 @@ class TrialSummary:
         self.whiskers = record.names
         self.stages = tuple(stage for stage in STAGES if stage in recording.children)
         self.known = "; ".join(known.in_words() for known in record.objects)
-        time = record.root.data["time"].values
-        self.frames = len(time)
-        self.duration = self.frames * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+        time = record.root.data["time"]
+        self.frames, timed = time.size, time.size > 1 and not time.attrs.get("numbered")
+        self.duration = self.frames * float(np.median(np.diff(time.values))) if timed else 0.0
         touching = record.known("in_contact", _BEFORE)
         self.in_contact = None if touching is None else int(touching.any(axis=1).sum())
         self.contacts = None

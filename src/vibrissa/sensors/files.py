@@ -405,6 +405,12 @@ class Stage:
         if moves not in ("sensor", "object"):
             raise ValueError(f"moves is {quoted(moves)}; 'sensor' or 'object' is needed")
         axes = _directions(own, "sweep")
+        touched = subtable(self._table, "touches").get("file")
+        if isinstance(touched, str) and (self.folder / touched).resolve() == Path(path).resolve():
+            raise ValueError(
+                f"{path} has the touches of the calibration; a sweep is needed, whose samples "
+                "follow one another along one motion"
+            )
         position = self._columns(Path(path), _names(self._table, "position"))
         position = self._unit * (position - three_numbers(own, "origin", (0.0, 0.0, 0.0)))
         return StageSweep(

@@ -7,6 +7,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -72,6 +73,8 @@ class ContactStream:
         Numbers of samples by status, and by event.
     poses : Poses
         Poses of the base.
+    clock : callable
+        Time of a sample whose line has none.
     friction : float
         Standard deviation of the ratio of forces, as in `vibrissa.contacts.Contacts`.
     laboratory : str
@@ -104,7 +107,7 @@ class ContactStream:
         self.friction = estimator.friction
         self._which = [SIGNALS.index(name) for name in by_name] if names is None else []
         begun, self._time = time.monotonic(), -math.inf
-        self._clock = clock or (lambda: time.monotonic() - begun)
+        self.clock = clock or (lambda: time.monotonic() - begun)
         self.statuses: Counter[str] = Counter()
         self.events: Counter[str] = Counter()
         self._headers = 0
@@ -196,7 +199,7 @@ class ContactStream:
             Record for JSON.
         """
         self.untimed += sample.time is None
-        time = self._clock() if sample.time is None else sample.time
+        time = self.clock() if sample.time is None else sample.time
         # After a header any decrease of time is a restart. Senders may repeat headers, as UDP does
         # not guarantee delivery.
         if time < self._time - (_ANEW if self.lines.headers == self._headers else 0.0):
@@ -322,7 +325,7 @@ class ContactStreams:
         names = [one.whisker for one in streams]
         if len(set(names)) < len(names) or (len(names) > 1 and "" in names) or not names:
             raise ValueError(f"whiskers need different names; got {names}")
-        self.streams = tuple(streams)
+        self.streams, self._clock = tuple(streams), streams[0].clock
 
     def records(self, lines: Iterable[str]) -> Iterator[dict[str, Any]]:
         """Convert lines to records, one for each whisker with signals in a line.
@@ -338,6 +341,9 @@ class ContactStreams:
             Record as from `ContactStream.records`; one error for a line that no whisker can read.
         """
         for line in lines:
+            now = cache(self._clock)  # the whiskers of a line without a time are read at one time
+            for one in self.streams:
+                one.clock = now
             found = [record for one in self.streams for record in one.records((line,))]
             good = [record for record in found if "error" not in record]
             yield from good or found[:1]

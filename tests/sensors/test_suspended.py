@@ -194,6 +194,9 @@ def test_too_few_or_idle_touches_are_refused():
         calibrate_suspension(WIRE, at, readings * [1, 0, 1], channels=CHANNELS)
     with pytest.raises(ValueError, match=r"\(n, 3\)"):
         calibrate_suspension(WIRE, at[:, :2], readings)
+    for sigma in (0.15, -1e-3, np.nan):
+        with pytest.raises(ValueError, match=r"base_sigma is .* m; more than 0"):
+            calibrate_suspension(WIRE, at, readings, base_sigma=sigma)
     with pytest.raises(ValueError, match=r"0 of 30 touches.* Are origin, axes and unit"):
         calibrate_suspension(WIRE, at + 0.05, readings)
 
@@ -244,6 +247,13 @@ def test_a_sweep_finds_onset_contact_points_and_normals():
     assert np.median(np.linalg.norm(away, axis=1)) < 1e-3
     outward = (found.points[both] - axis)[:, :2] / radius
     assert np.median(np.abs(np.sum(outward * found.normal[both][:, :2], axis=1))) > 0.98
+
+
+def test_a_sweep_of_nothing_or_with_another_rest_is_refused():
+    with pytest.raises(ValueError, match="got 0 readings"):
+        follow_sweep(TRUE, np.zeros((0, 3)), np.zeros((0, 3)))
+    with pytest.raises(ValueError, match=r"rest \(3,\) or \(5, 3\) is needed; got \(2,\)"):
+        follow_sweep(TRUE, np.zeros((5, 3)), np.zeros((5, 3)), rest=[0.0, 0.0])
 
 
 def test_contacts_do_not_depend_on_how_often_samples_are_taken():

@@ -414,7 +414,10 @@ def follow_sweep(
         )
     turn = np.broadcast_to(turn, (len(y), 3, 3))
     _check_sweep(sensor, y, base)
-    change = y - (y[0] if rest is None else numbers("rest", rest, any_unit=True))
+    free = y[0] if rest is None else numbers("rest", rest, any_unit=True)
+    if free.shape not in ((k,), y.shape):
+        raise ValueError(f"rest ({k},) or {y.shape} is needed; got {free.shape}")
+    change = y - free
     touching = np.any(np.abs(change) > _TOUCHED * sensor.uncertainty, axis=1)
     n = len(y)
     out = SweptContacts(
@@ -441,6 +444,8 @@ def follow_sweep(
 
 def _check_sweep(sensor: SuspendedWhisker, readings: Array, base: Array) -> None:
     """Raise ValueError if numbers are missing, or steps are longer than the whisker."""
+    if not len(readings):
+        raise ValueError("a sweep without samples has no contacts; got 0 readings")
     known = np.isfinite(readings).all(axis=1) & np.isfinite(base).all(axis=1)
     if not known.all():
         which = ", ".join(str(i) for i in np.flatnonzero(~known)[:5])

@@ -169,6 +169,11 @@ def calibrate_suspension(
     zero = np.zeros(y.shape[1]) if rest is None else numbers("rest", rest, any_unit=True)
     if len(names) != y.shape[1] or zero.shape != (y.shape[1],):
         raise ValueError(f"{y.shape[1]} channels have names {names} and rest {zero.tolist()}")
+    if not 0.0 < base_sigma < whisker.length:
+        raise ValueError(
+            f"base_sigma is {base_sigma:g} m; more than 0 and less than the whisker's length, "
+            f"{whisker.length:.3g} m, is needed"
+        )
     known = np.isfinite(p).all(axis=1) & np.isfinite(y).all(axis=1)
     if known.sum() < FEWEST:
         raise ValueError(f"{known.sum()} touches are too few; {FEWEST} are needed")

@@ -155,6 +155,39 @@ def test_shapes_that_do_not_fit_one_another_without_inertia_keep_it():
     assert len(calls) == 1
 
 
+@pytest.mark.parametrize(
+    ("frequency", "amplitude", "rate", "peg"),
+    [
+        (19.0, 8.0, 300.0, (19.1, 1.5)),
+        (12.0, 11.0, 300.0, (24.8, 3.1)),
+        (17.0, 16.0, 500.0, (17.1, -0.9)),
+    ],
+)
+def test_contacts_most_of_the_time_are_not_inertia(frequency, amplitude, rate, peg):
+    """They bend a whisker in step with its acceleration, or with its velocity."""
+    motion = whisking(
+        2.5 / frequency,
+        rate,
+        frequency=frequency,
+        amplitude=np.radians(amplitude),
+        set_point=np.radians(5.0),
+    )
+    peg = Peg(1e-3 * np.array([*peg, 0.0]), np.array([0.0, 0.0, 1.0]), 0.5e-3)
+    truth = simulate(WHISKER, motion, peg)["truth"].to_dataset().isel(whisker=0)
+    lines, share = truth["centerline"].values, np.linspace(0.0, 1.0, 40)
+    curves = CubicSpline(np.linspace(0.0, 1.0, lines.shape[1]), lines, axis=1)(share)
+    waves = np.cos(np.pi * share * np.arange(6)[:, None])
+    draw = np.random.default_rng(3).normal(size=(len(curves), 6, 3))
+    curves += 2e-6 * np.einsum("tkd,kn->tnd", draw, waves)
+    assert (truth["in_contact"] > 0).mean() > 0.65
+
+    def rest(shapes, _):
+        return rest_shape(shapes)
+
+    before = rest_shape(curves)
+    assert inertia_of(curves, before, WHISKER, rest, rate, 90e-6, stated=True) is None
+
+
 @pytest.mark.parametrize("lost", [slice(50, 51), slice(50, 57), slice(0, 5), slice(50, 75, 8)])
 def test_lost_frames_do_not_accelerate_a_whisker(lost):
     rate, seen = 1000.0, np.ones(120, dtype=bool)

@@ -161,10 +161,16 @@ def _explaining(
             break
     shape = rest(curves - found.displacement, found.unsure)
     free = shape.free & np.isfinite(before.deviation)
-    if not free.any():
+    kept = free & before.free
+    if not kept.any():
         return None
     usual, left = (np.quantile(each.deviation[free], _USUAL) for each in (before, shape))
-    return found if usual > _SMALL * pixel and left < _FAR_LESS * usual else None
+    # Where contacts are taken for inertia, frames in air deviate by what is subtracted from them.
+    kept_before, kept_after = (
+        np.quantile(each.deviation[kept], _USUAL) for each in (before, shape)
+    )
+    explains = usual > _SMALL * pixel and left < _FAR_LESS * usual and kept_after < kept_before
+    return found if explains else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,14 @@ from scipy.spatial.transform import Rotation
 from vibrissa.cameras import orthogonal_views, triangulate
 from vibrissa.tracking import Trace
 from vibrissa.tracking.refine.fit import RodFit
-from vibrissa.tracking.refine.optics import Optics, rough_optics, stated_lenses, with_optics_unsure
+from vibrissa.tracking.refine.optics import (
+    Optics,
+    rough_optics,
+    stated_lenses,
+    unchecked_optics,
+    with_optics_unsure,
+)
+from vibrissa.tracking.refine.rods import deformations
 from vibrissa.tracking.space.frame_pairs import clear_offsets
 
 PIXEL = 150e-6
@@ -119,6 +126,45 @@ def test_turns_that_are_not_known_are_in_the_displacements():
     found = rough_optics(STATED, traces(still, [TOP, FRONT], 1e6)).as_stated()
     moved = np.linalg.norm(found.displacements(np.array([[10e-3, 0.0, 8e-3]])), axis=(0, -1))
     assert moved[0] > 8e-3 * found.sigma[2:5].max() * 0.5
+
+
+def test_a_base_that_fur_hides_in_one_view_is_no_evidence_of_optics():
+    """The second view shows 0.7 mm less of the whisker at its base in all frames."""
+    top, front = traces(sweep(), [TOP, FRONT], 0.4)
+    shown = [Trace(one.line[2:], one.sigma[2:], one.seen[2:], 1.0) for one in front]
+    found = rough_optics(STATED, [top, shown])
+    wrong = found.values - [2.5, 2.5, 0.0, 0.0, 0.0, 0.0, 0.0]
+    assert wrong @ np.linalg.solve(found.covariance, wrong) < 14.1
+    assert (np.abs(wrong[:2]) < 0.5).all()
+
+
+def test_cameras_that_no_free_frame_can_check_are_as_unsure_as_they_were_stated():
+    one = unchecked_optics(STATED[:1], 0.5)
+    assert one.cameras[0].projection == "perspective"
+    np.testing.assert_allclose([one.values, one.sigma], [[2.0], [0.7]])
+    both = unchecked_optics(STATED)
+    assert [camera.projection for camera in both.cameras] == ["orthographic"] * 2
+    assert np.linalg.norm(both.displacements(np.full(3, 20e-3))) > 1e-3
+
+
+def test_only_what_rigid_motions_and_one_shape_do_not_explain_bends_a_whisker():
+    points = sweep(12)[:, ::10]
+    free = np.arange(12) < 6
+    rng = np.random.default_rng(1)
+    turns = 1e-3 * rng.normal(size=(12, 1, 3))
+    rotation = Rotation.from_rotvec(rng.normal(size=(12, 3))).as_matrix()
+    shape = np.zeros((points.shape[1], 3))
+    shape[:, 1] = np.linspace(-1e-4, 1e-4, len(shape)) ** 2
+    start = rotation[:1].swapaxes(1, 2) @ points[0].T
+    same = (rotation @ start).swapaxes(1, 2)
+    moved = np.cross(turns, same) + 1e-4 * rng.normal(size=(12, 1, 3))
+    moved = moved + (rotation @ shape.T).swapaxes(1, 2)
+    left = deformations(moved[None], same, rotation, free)
+    np.testing.assert_allclose(left, 0.0, atol=1e-15)
+    moved[9] += same[9] ** 2
+    left = deformations(moved[None], same, rotation, free)
+    assert np.abs(left[0, 9]).max() > 1e-5
+    np.testing.assert_allclose(np.delete(left, 9, axis=1), 0.0, atol=1e-15)
 
 
 def test_orthographic_views_are_explained_by_what_was_stated():

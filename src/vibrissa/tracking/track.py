@@ -51,7 +51,7 @@ from vibrissa.tracking.refine.inertia import inertia_of
 from vibrissa.tracking.refine.optics import (
     Optics,
     rough_optics,
-    stated_lenses,
+    unchecked_optics,
     with_depth_unsure,
     with_optics_unsure,
     with_shift_unsure,
@@ -240,7 +240,7 @@ def track(
     rows = [list(row) for row in zip(*timed_rows, strict=True)]
 
     def tracked(k: int, used: Sequence[Sequence[Trace]]) -> Tracked:
-        given = called[k], progress, moving, objects, sample, count > 1, hidden[k]
+        given = called[k], progress, moving, objects, sample, count > 1, hidden[k], optics
         return track_whisker(cameras, used, rate, options, *given)
 
     known = partial(known_of, cameras, rate=rate, options=options.fit)
@@ -422,14 +422,15 @@ def _corrected(
     traces: Sequence[Sequence[Trace]],
     pairs: NDArray[np.int64],
     distance: float | None,
-) -> tuple[Optics | None, Sequence[Camera], list[str]]:
+) -> tuple[Optics, Sequence[Camera], list[str]]:
     """Errors of the cameras inferred from a free whisker, corrected cameras, and remarks."""
     rows = [[view[i] for i in pairs[:, v]] for v, view in enumerate(traces)]
     optics = rough_optics(cameras, rows, distance)
     stated = "orthographic cameras" if distance is None else f"lenses at {distance:g} m"
     if optics is None:
         doubt = f"too few frames show a free whisker to check that {stated} explain the views."
-        return None, stated_lenses(cameras, distance), [doubt]
+        optics = unchecked_optics(cameras, distance)
+        return optics, optics.cameras, [doubt]
     if not optics.needed:
         optics = optics.as_stated()
         return optics, optics.cameras, []
@@ -459,6 +460,7 @@ def track_whisker(
     sample: Sequence[Sequence[Frame]] = (),
     row: bool = False,
     hidden: HiddenPart = _NOTHING,
+    optics: Optics | None = None,
 ) -> Tracked:
     """Track one whisker, or one of a row, from traces of frames that belong together, by view."""
     report = progress or (lambda stage, done, total: None)
@@ -500,6 +502,7 @@ def track_whisker(
     within = plane.head or head
     fitter = Fitter(cameras, fitted, touching, on_head, rate, options.fit, within, objects)
     fitter = replace(fitter, unsure=plane.unsure, hook=hook, inertia=inertia)
+    fitter = replace(fitter, displaced=None if optics is None else optics.displacements)
     more = hidden.before(shape.length) * scaled
     used_options = replace(options, fur=options.fur + more)
     found = _found(fitter, shape, whisker, used, tips, sparse, used_options, sample)

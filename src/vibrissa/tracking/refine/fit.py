@@ -284,6 +284,7 @@ class Fitter:
     unsure: Array | None = None
     hook: Hook | None = None  # at the base, which is not on the whisker
     inertia: Inertia | None = None  # that traces and curves are without
+    displaced: Callable[[Array], Array] | None = None  # `Problem.displaced`
 
     def fit(
         self, whisker: Whisker, pose: BasePose, nodes: int, length: Length | None = None
@@ -415,6 +416,7 @@ class Fitter:
             near,
             begun,
             inertia=self.inertia and self.inertia.rows(frames),
+            displaced=self.displaced,
         )
 
     def _nearest(self, frames: NDArray[np.intp]) -> tuple[Mask, Array]:
@@ -432,7 +434,7 @@ class Fitter:
         return near, arcs[np.arange(len(at)), at]
 
 
-def _shared(problem: Problem, fit: Linear, unsure: Array) -> Array:
+def _shared(problem: Problem, state: State, fit: Linear, unsure: Array) -> Array:
     """Changes (error, time, unknown) due to errors of traces that all frames share, one sigma each.
 
     Light from the side, a halo of compression or fur over the base shift a trace equally in many
@@ -441,7 +443,7 @@ def _shared(problem: Problem, fit: Linear, unsure: Array) -> Array:
     the means of the residuals over frames with and without contact. The edge of an object displaces
     a trace next to the contact, by as much again as the residuals there.
     """
-    pulls = []
+    pulls = problem.deformed(state, fit)
     parts = [fit.left(rows) for rows in (problem.touching, ~problem.touching)]
     trusted = problem.variance or [np.ones((1, 3)) for _ in fit.data.misses]
     together = correlated(
@@ -605,7 +607,7 @@ def _answer(
 ) -> RodFit:
     """Results in SI units, relative to the head."""
     d, touching = problem.d, problem.touching
-    shared, misfit = _shared(problem, fit, unsure), fit.data.misfit
+    shared, misfit = _shared(problem, state, fit, unsure), fit.data.misfit
     covariance = spread + np.einsum("kti,ktj->tij", shared, shared)
     turned, slopes, slope = contact_slopes(d, state)
     point, wrench = _contacts(problem, state)

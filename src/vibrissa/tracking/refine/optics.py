@@ -32,7 +32,7 @@ from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated
 
 # Standard deviation of the inverse of a distance that is not stated, 1/m: lenses at 0.5 m.
 _STRENGTH = 2.0
-_DISTANCE = 0.1  # standard deviation of a stated distance, as a share of it
+_DISTANCE = 0.35  # standard deviation of the inverse of a stated distance, as a share of it
 # Inverse of the largest distance that is not infinite, and of the smallest one, 1/m.
 _FLAT, _STRONGEST = 1e-6, 20.0
 _BEHIND = np.diag([-1.0, 1.0, -1.0])  # axes of a camera on the opposite side
@@ -57,14 +57,15 @@ _ROUNDS, _DAMPING = 12, 1e-3  # number of Gauss–Newton steps, and Levenberg's 
 # share of their spacing.
 _LOOSE, _SLIDING = 0.02, 0.05
 _STEP = 1e-3  # step of differences by the optics, in their standard deviations
-# Standard deviation to which traces are set, pixels: as their errors are common to many points and
-# frames, it is far above that of one point.
+# Standard deviation to which traces are set at first, pixels: as their errors are common to many
+# points and frames, vary with the pose, and frames that are hardly bent may be among the free ones,
+# it is far above that of one point.
 _UNIT = 0.5
 # The same in units of what is left of them, and its smallest value, pixels.
-_COMMON, _SHARPEST = 5.0, 0.1
-# The same for covariances: errors of traces vary with the pose, and frames that are hardly bent may
-# be among the free ones.
-_SYSTEMATIC = 10.0
+_COMMON, _SHARPEST = 10.0, 0.1
+# Weight of where traces begin: fur hides more of the base in one view than in the other, by several
+# pixels in all frames.
+_BEGINNINGS = 0.2
 _AROUND = 5e-3  # distance over which displacements by the cameras' errors are nearly linear, m
 _DECIDED = 3.0  # difference of log-likelihoods from which a mirrored view is on one side
 _SELECTIONS = 3  # number of rounds in which frames that are bent are left out
@@ -167,6 +168,22 @@ def rough_optics(
     return estimated_optics(cameras, TraceSeries.of(some), curves, shape, distance)
 
 
+def unchecked_optics(cameras: Sequence[Camera], distance: float | None = None) -> Optics:
+    """Optics as they are stated, with their uncertainty, if no free frame can check them."""
+    stated, size = _prior(cameras, distance)
+    lenses = with_optics(cameras, stated)
+    known = np.diag(size**2), stated, size, np.nan, np.nan, distance
+    return Optics(lenses, tuple(cameras), stated, *known)
+
+
+def _prior(cameras: Sequence[Camera], distance: float | None) -> tuple[Array, Array]:
+    """Values of the optics as they are stated, and their standard deviations."""
+    more = len(cameras) - 1
+    lenses = [_strength(camera, distance) for camera in cameras]
+    spreads = [spread for _, spread in lenses] + [_TURN, _TURN, _TURN, _SCALE, _SHIFT] * more
+    return np.concatenate([[mean for mean, _ in lenses], np.zeros(5 * more)]), np.array(spreads)
+
+
 def stated_lenses(cameras: Sequence[Camera], distance: float | None) -> tuple[Camera, ...]:
     """Give orthographic cameras lenses at a distance from the origin; None: none."""
     strength = 0.0 if distance is None else 1.0 / distance
@@ -240,7 +257,7 @@ def estimated_optics(
         fitted.cameras_at(fitted.q),
         fitted.stated,
         stated + fitted.q * size,
-        fitted.unsure * np.outer(size, size),
+        fitted.covariance * np.outer(size, size),
         stated,
         size,
         before.mean_miss,
@@ -298,10 +315,7 @@ class _Problem:
         s = arc_lengths(line)
         points = interpolated(np.linspace(0.0, _LENGTH * s[-1], _NODES), s, line)
         back = [motions(line[None, :n], part[:n]) for n, part in zip(known, shapes, strict=True)]
-        more = len(cameras) - 1
-        lenses = [_strength(camera, distance) for camera in cameras]
-        start = np.concatenate([[mean for mean, _ in lenses], np.zeros(5 * more)])
-        size = [spread for _, spread in lenses] + [_TURN, _TURN, _TURN, _SCALE, _SHIFT] * more
+        start, size = _prior(cameras, distance)
         even = replace(traces, sigma=np.where(np.isfinite(traces.sigma), _UNIT, np.nan))
         return cls(
             tuple(cameras),
@@ -310,7 +324,7 @@ class _Problem:
             np.concatenate([b[0] for b in back]),
             np.concatenate([b[1] for b in back]),
             np.zeros(len(start)),
-            (start, np.array(size)),
+            (start, size),
         )
 
     @property
@@ -318,16 +332,9 @@ class _Problem:
         """Covariance of the optics q."""
         return np.asarray(np.linalg.inv(self.normal()[0])[-len(self.q) :, -len(self.q) :])
 
-    @property
-    def unsure(self) -> Array:
-        """Covariance of the optics q, of which the traces state less than they seem to."""
-        stated, size = np.eye(len(self.q)), max(_SYSTEMATIC * self.mean_miss, _SHARPEST)
-        data = np.linalg.inv(self.covariance) - stated
-        return np.asarray(np.linalg.inv(data * (self.unit / size) ** 2 + stated))
-
     def sharper(self) -> _Problem:
         """The problem with traces weighted by their residuals."""
-        unit = float(np.clip(_COMMON * self.mean_miss, _SHARPEST, _UNIT))
+        unit = max(_COMMON * self.mean_miss, _SHARPEST)
         sigma = np.where(np.isfinite(self.traces.sigma), unit, np.nan)
         return replace(self, traces=replace(self.traces, sigma=sigma), unit=unit)
 
@@ -412,7 +419,9 @@ class _Problem:
                 design[:, np.arange(n + 2), 3 * where + axis] = shape[..., axis]
             design[..., 3 * n :] = optics
             # The tip of the traces is not that of the part of the shape that is compared.
-            design[:, -1], pose[:, -1], misses[:, -1] = 0.0, 0.0, 0.0
+            for part in (design, pose, misses):
+                part[:, -2] *= _BEGINNINGS
+                part[:, -1] = 0.0
             inner += np.einsum("tni,tnj->tij", pose, pose)
             mixed += np.einsum("tni,tnj->tij", pose, design)
             common += np.einsum("tni,tnj->ij", design, design)

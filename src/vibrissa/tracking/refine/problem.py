@@ -23,7 +23,7 @@ trusted less, and so is such a part of the whisker.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -46,6 +46,7 @@ from vibrissa.tracking.refine.rods import (
     State,
     TraceSeries,
     contact_slopes,
+    deformations,
     placed,
     turns,
 )
@@ -426,6 +427,7 @@ class Problem:
     fixed: bool = False  # whether the peg is as it is in the state that the fit begins with
     enough: float = _SETTLED  # expected decrease of the cost below which a step is the last
     inertia: Inertia | None = None  # that traces are without
+    displaced: Callable[[Array], Array] | None = None  # points (error, ..., 3) by cameras' errors
 
     def rows(self, rows: NDArray[np.intp], begun: State) -> Problem:
         """The problem restricted to some frames, which begins there."""
@@ -593,14 +595,28 @@ class Problem:
         uneven = np.zeros_like(points)
         middle = np.flatnonzero(even[1:] & even[:-1]) + 1
         uneven[middle] = points[middle - 1] - 2.0 * points[middle] + points[middle + 1]
+        pull = self._pulls(points, _EXPOSED * uneven, fit)
+        return np.asarray(np.einsum("tij,tj->ti", covariance, pull))
+
+    def deformed(self, state: State, fit: Linear) -> list[Array]:
+        """Pulls (time, unknown) on the unknowns due to errors of the cameras, one sigma each."""
+        if self.displaced is None:
+            return []
+        points = self.head.put_in(placed(self.d, state, self.shown) * self.d.length)
+        rotation = self.head.rotation @ state.rotation
+        shifts = deformations(self.displaced(points), points, rotation, ~self.touching)
+        return [self._pulls(points, shift, fit) for shift in shifts]
+
+    def _pulls(self, points: Array, shift: Array, fit: Linear) -> Array:
+        """Pulls (time, unknown) on the unknowns if points (time, point, 3), m, appear displaced."""
         pull = np.zeros((len(points), UNKNOWNS))
         for view, (camera, design) in enumerate(zip(self.cameras, fit.data.designs, strict=True)):
             pixels, slopes = camera.project_with_slopes(points)
-            moved = camera.project(points + _EXPOSED * uneven)
+            moved = camera.project(points + shift)
             misses = [self.traces.equations(view, at, slopes)[1][:, :-2] for at in (pixels, moved)]
-            shift = np.where((misses[0] == 0.0) | (misses[1] == 0.0), 0.0, misses[0] - misses[1])
-            pull += np.einsum("tni,tn->ti", design[:, :-2], shift)
-        return np.asarray(np.einsum("tij,tj->ti", covariance, pull))
+            seen = (misses[0] != 0.0) & (misses[1] != 0.0)
+            pull += np.einsum("tni,tn->ti", design[:, :-2], seen * (misses[0] - misses[1]))
+        return pull
 
     def _touched(self, smoother: Smoother, state: State, data: Compared) -> Array:
         """Pull contacts to the surfaces of known objects, and make them tangent; return the costs.

@@ -340,6 +340,23 @@ def placed(d: Discretization, state: State, shown: float = 1.0) -> Array:
     return np.asarray(points @ np.swapaxes(state.rotation, 1, 2) + state.position[:, None])
 
 
+def deformations(shifts: Array, points: Array, rotation: Array, free: Mask) -> Array:
+    """How shifts (error, t, n, 3) of a whisker's points bend it, or seem to bend it.
+
+    The rigid motion nearest to them is a motion of its base, and their mean over free frames,
+    relative to the base, is a change of its shape at rest.
+    """
+    around = points - points.mean(axis=1, keepdims=True)
+    motions = pose_slopes(around)
+    inverse = np.linalg.inv(np.einsum("tnij,tnik->tjk", motions, motions))
+    poses = np.einsum("tjk,tnik,etni->etj", inverse, motions, shifts)
+    left = shifts - np.einsum("tnij,etj->etni", motions, poses)
+    if free.any():
+        rest = np.einsum("tij,etni->etnj", rotation[free], left[:, free]).mean(axis=1)
+        left = left - np.einsum("tij,enj->etni", rotation, rest)
+    return np.asarray(left)
+
+
 def pose_slopes(turned: Array) -> Array:
     """Derivatives (..., 3, 6) of points, relative to the base, by its shift and its turn."""
     slopes = np.zeros((*turned.shape, 6))

@@ -32,7 +32,7 @@ from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated
 
 # Standard deviation of the inverse of a distance that is not stated, 1/m: lenses at 0.5 m.
 _STRENGTH = 2.0
-_DISTANCE = 0.35  # standard deviation of the inverse of a stated distance, as a share of it
+_DISTANCE = 0.1  # standard deviation of the inverse of a stated distance, as a share of it
 # Inverse of the largest distance that is not infinite, and of the smallest one, 1/m.
 _FLAT, _STRONGEST = 1e-6, 20.0
 _BEHIND = np.diag([-1.0, 1.0, -1.0])  # axes of a camera on the opposite side

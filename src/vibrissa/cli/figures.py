@@ -215,8 +215,8 @@ def lacking_of(
     course: vb.scene.Course, trial: xr.DataTree, path: Path
 ) -> Iterator[tuple[str, str]]:
     """Yield what a trial lacks, with the verb that computes it, by the picture that needs it."""
-    if course.signals is None and "estimates" in trial.children:
-        yield "signals", "no signals: its contacts were estimated without, as those of a sweep"
+    if course.signals is None and str(trial.attrs.get("origin")).startswith("swept"):
+        yield "signals", "no signals: contacts of a sweep are estimated without them"
     elif course.signals is None:
         yield "signals", f"no signals: `vibrissa signals {path}` makes them"
     if course.estimated is None and "estimates" in trial.children:
